@@ -1,0 +1,2 @@
+"""Teach a robot a skill from one demonstration (SART)."""
+

@@ -1,0 +1,1 @@
+"""Self-augmentation: which poses to visit (strategies) and visiting them (engine)."""

@@ -1,0 +1,151 @@
+"""The interface between the toolkit and a simulator or robot."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from sart_toolkit.errors import MissingCapability
+from sart_toolkit.poses import Array
+from sart_toolkit.records import DepthImage, Image
+from sart_toolkit.robots.spec import CameraSpec, RobotSpec
+from sart_toolkit.scene.spec import SceneSpec, SceneState
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a backend can do; asking for more raises `MissingCapability`, nothing is silent."""
+
+    can_restore: bool
+    has_contacts: bool
+    renders: bool
+    observes_bodies: bool
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """One picture: `rgb (H,W,3)` uint8, `depth (H,W)` float32 [m] along z, 0 where nothing was hit.
+
+    `T_world_camera (4,4)`: where it was taken from, z forward, x right, y down.
+    """
+
+    rgb: Image
+    depth: DepthImage
+    T_world_camera: Array
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the robot measures now.
+
+    `q`, `dq (n,)` [rad, rad/s]; `gripper` in [0, 1]; `T_world_tool (4,4)`; `time` [s] since reset;
+    `cameras` holds the pictures asked for; `Ts_world_body` the simulated bodies, held ones too.
+    """
+
+    q: Array
+    dq: Array
+    gripper: float
+    T_world_tool: Array
+    time: float
+    cameras: Mapping[str, CameraView] = field(default_factory=dict)
+    Ts_world_body: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Two bodies that touched during the last control period, at any of its physics steps.
+
+    `a`, `b`: link or body names; `force` [N]: greatest normal force; `penetration` [m] >= 0.
+    """
+
+    a: str
+    b: str
+    force: float
+    penetration: float
+
+
+class Backend(abc.ABC):
+    """A robot in its scene, stepped at 30 Hz: what every simulator and robot implements.
+
+    Attributes:
+        robot: the robot's specification.
+        scene: what surrounds it.
+        image_size: width and height of pictures [pixels].
+        capabilities: what it can do, readable before connecting.
+    """
+
+    name: str
+    capabilities: Capabilities
+
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
+        self.robot = robot
+        self.scene = scene
+        self.image_size = image_size
+
+    @property
+    def cameras(self) -> dict[str, CameraSpec]:
+        """The cameras by name: the robot's wrist camera and the scene's."""
+        return {c.name: c for c in (self.robot.wrist_camera, *self.scene.cameras)}
+
+    @abc.abstractmethod
+    def reset(self, state: SceneState) -> None:
+        """Put robot and bodies at rest in a state; time becomes 0.
+
+        Raises:
+            InvalidInput: joints of the wrong number or outside their limits.
+            UnknownName: the state has a body that the scene hasn't, or lacks one.
+        """
+
+    @abc.abstractmethod
+    def observe(self, cameras: Sequence[str] = ()) -> Observation:
+        """Measure joints, gripper, tool and bodies, with pictures of the named cameras.
+
+        Raises:
+            UnknownName: no such camera.
+        """
+
+    @abc.abstractmethod
+    def command(self, q: Array, gripper: float) -> None:
+        """Set joint targets `(n,)` [rad] and gripper target in [0, 1], reached over the next step.
+
+        Raises:
+            InvalidInput: wrong shape, not finite, outside limits.
+        """
+
+    @abc.abstractmethod
+    def step(self) -> None:
+        """Advance one control period, 1/30 s."""
+
+    @abc.abstractmethod
+    def save(self) -> bytes:
+        """The state as bytes that `restore` takes, in this process or another.
+
+        Raises:
+            MissingCapability: `can_restore` is false.
+        """
+
+    @abc.abstractmethod
+    def restore(self, state: bytes) -> None:
+        """Return to a saved state exactly.
+
+        Raises:
+            BrokenFile: the bytes are damaged or of another robot or scene.
+            MissingCapability: `can_restore` is false.
+        """
+
+    @abc.abstractmethod
+    def contacts(self) -> list[Contact]:
+        """Which bodies touched during the last `step`, scene against scene left out.
+
+        Raises:
+            MissingCapability: `has_contacts` is false.
+        """
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Free the simulator or connection; calling it again does nothing."""
+
+    def _lacks(self, what: str) -> MissingCapability:
+        return MissingCapability(f"backend {self.name!r} can't {what}; use another backend")
+

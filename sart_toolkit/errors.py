@@ -1,0 +1,68 @@
+"""Exception classes of the toolkit: every error it raises on purpose is a `SartError`."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class SartError(Exception):
+    """Base of all errors raised on purpose; the command line prints it as one line."""
+
+
+class InvalidInput(SartError, ValueError):
+    """A value, shape, name or option is not acceptable."""
+
+
+class UnknownName(SartError, LookupError):
+    """A name is not in the table it was looked up in."""
+
+
+class MissingFile(SartError, FileNotFoundError):
+    """A file or directory that should be read does not exist."""
+
+
+class BrokenFile(SartError, OSError):
+    """A file exists but can't be read as what it should be."""
+
+
+class OutputExists(SartError, FileExistsError):
+    """Writing would replace something; nothing was written."""
+
+
+class CannotWrite(SartError, OSError):
+    """The disk refuses a write: permission, space or a missing parent."""
+
+
+class Unreachable(SartError, ValueError):
+    """No joint configuration within limits reaches the pose."""
+
+
+class MotionRejected(SartError, RuntimeError):
+    """A motion can't be executed as asked: joint jump or limits."""
+
+
+class MissingCapability(SartError, NotImplementedError):
+    """A backend was asked for something that it declares it can't do."""
+
+
+class MissingExtra(SartError, ImportError):
+    """An optional dependency is not installed; the message says how to install it."""
+
+
+class Mismatch(SartError, ValueError):
+    """Two things that belong together don't: an annotation and another demonstration, say."""
+
+
+def unknown_name(kind: str, name: str, choices: Iterable[str]) -> UnknownName:
+    """An `UnknownName` that lists the choices and offers the nearest one.
+
+    Args:
+        kind: what was looked up, such as "task".
+        name: the name that is not there.
+        choices: the names that are.
+    """
+    choices = sorted(choices)
+    near = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return UnknownName(f"unknown {kind} {name!r}: {hint}choose from {', '.join(choices)}")

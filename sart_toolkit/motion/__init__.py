@@ -1,0 +1,1 @@
+"""How the tool moves: straight lines in time (`StraightLine`) and following them (`ToolController`)."""

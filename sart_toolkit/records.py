@@ -1,0 +1,399 @@
+"""The frozen records that the stages hand to each other; arrays are copied in and read-only."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sart_toolkit.errors import InvalidInput, Mismatch
+from sart_toolkit.poses import (
+    Array,
+    apply_motion,
+    check_array,
+    check_pose,
+    check_poses,
+    check_positive,
+    frozen,
+    relative_motion,
+)
+
+Image = NDArray[np.uint8]
+DepthImage = NDArray[np.float32]
+ACTION_SIZE = 7
+RECORD_HZ = 10
+CONTROL_HZ = 30
+PHYSICS_HZ = 240
+CONTROL_PER_RECORD = CONTROL_HZ // RECORD_HZ
+# nu_r [rad/m]: rotation drawn per metre of radius, the published code's value.
+ROTATION_PER_METRE = 2.0
+
+
+def actions_from_commands(commanded_Ts_world_tool: Array, commanded_gripper: Array) -> Array:
+    """The actions `(n, 7)` that lead along a sequence of commands.
+
+    Action t is the commanded tool pose t+1 relative to commanded tool pose t (xyz [m], rotation
+    vector [rad], in the tool frame of t) and the gripper target of t+1 in [0, 1]. The last action
+    holds: no motion, same gripper target.
+
+    Args:
+        commanded_Ts_world_tool: `(n, 4, 4)`.
+        commanded_gripper: `(n,)`.
+    """
+    n = len(commanded_Ts_world_tool)
+    actions = np.zeros((n, ACTION_SIZE))
+    for t in range(n - 1):
+        actions[t, :6] = relative_motion(commanded_Ts_world_tool[t], commanded_Ts_world_tool[t + 1])
+    actions[:-1, 6] = commanded_gripper[1:]
+    actions[-1, 6] = commanded_gripper[-1]
+    return actions
+
+
+def apply_action(T_world_tool: Array, action: Array) -> tuple[Array, float]:
+    """The next commanded tool pose `(4, 4)` and gripper target after an action `(7,)`."""
+    return apply_motion(T_world_tool, action[:6]), float(np.clip(action[6], 0.0, 1.0))
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of Python, the toolkit and the libraries that results depend on."""
+    versions = {"python": platform.python_version()}
+    for name in ("sart_toolkit", "numpy", "pin", "coal", "ruckig", "pybullet", "torch", "h5py"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions
+
+
+def digest(parts: Mapping[str, Any]) -> str:
+    """A SHA-256 hex digest of named arrays and JSON values, independent of file layout."""
+    sha = hashlib.sha256()
+    for name in sorted(parts):
+        value = parts[name]
+        sha.update(name.encode())
+        if isinstance(value, np.ndarray):
+            sha.update(f"{value.dtype.str}{value.shape}".encode())
+            sha.update(np.ascontiguousarray(value).tobytes())
+        else:
+            sha.update(json.dumps(value, sort_keys=True).encode())
+    return sha.hexdigest()
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    """What one camera saw: `rgb (T,H,W,3)` uint8, `depth (T,H,W)` float32 metres (0: nothing hit).
+
+    `intrinsics (3,3)` in pixels; `T_tool_camera (4,4)`, camera frame z forward, x right, y down.
+    """
+
+    rgb: Image
+    depth: DepthImage
+    intrinsics: Array
+    T_tool_camera: Array
+
+    def __post_init__(self) -> None:
+        rgb = np.asarray(self.rgb)
+        depth = np.asarray(self.depth)
+        if rgb.ndim != 4 or rgb.shape[3] != 3 or rgb.dtype != np.uint8:
+            raise InvalidInput(
+                f"rgb: expected uint8 of shape (T, H, W, 3), got {rgb.dtype} {rgb.shape}"
+            )
+        if depth.shape != rgb.shape[:3]:
+            raise InvalidInput(f"depth: expected shape {rgb.shape[:3]}, got {depth.shape}")
+        object.__setattr__(self, "rgb", frozen(rgb))
+        object.__setattr__(self, "depth", frozen(depth, np.float32))
+        intrinsics = check_array("intrinsics", self.intrinsics, (3, 3))
+        object.__setattr__(self, "intrinsics", frozen(intrinsics))
+        object.__setattr__(
+            self, "T_tool_camera", frozen(check_pose("T_tool_camera", self.T_tool_camera))
+        )
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Recorded 10 Hz steps of a robot: what it measured, what it was commanded, what it saw.
+
+    `joint_positions`, `joint_velocities`, `commanded_joint_positions` are `(T, n)` [rad, rad/s];
+    `measured_Ts_world_tool`, `commanded_Ts_world_tool` are `(T, 4, 4)`; `measured_gripper` and
+    `commanded_gripper` are `(T,)` in [0, 1] (0 open); `contact_force (T,)` [N] is the greatest
+    force between two bodies during the step before, NaN where the backend can't tell; `cameras`
+    maps camera names to their records.
+    """
+
+    joint_positions: Array
+    joint_velocities: Array
+    commanded_joint_positions: Array
+    measured_Ts_world_tool: Array
+    commanded_Ts_world_tool: Array
+    measured_gripper: Array
+    commanded_gripper: Array
+    contact_force: Array
+    cameras: Mapping[str, CameraRecord]
+
+    def __post_init__(self) -> None:
+        n = len(self.measured_gripper)
+        for name in ("joint_positions", "joint_velocities", "commanded_joint_positions"):
+            object.__setattr__(self, name, frozen(check_array(name, getattr(self, name), (n, None))))
+        for name in ("measured_Ts_world_tool", "commanded_Ts_world_tool"):
+            poses = check_poses(name, getattr(self, name))
+            if len(poses) != n:
+                raise InvalidInput(f"{name}: expected {n} poses, got {len(poses)}")
+            object.__setattr__(self, name, frozen(poses))
+        for name in ("measured_gripper", "commanded_gripper"):
+            object.__setattr__(self, name, frozen(check_array(name, getattr(self, name), (n,))))
+        force = np.asarray(self.contact_force, dtype=np.float64)
+        if force.shape != (n,):
+            raise InvalidInput(f"contact_force: expected shape ({n},), got {force.shape}")
+        object.__setattr__(self, "contact_force", frozen(force))
+        for name, camera in self.cameras.items():
+            if len(camera.rgb) != n:
+                raise InvalidInput(f"camera {name!r}: expected {n} pictures, got {len(camera.rgb)}")
+        object.__setattr__(self, "cameras", dict(self.cameras))
+
+    def __len__(self) -> int:
+        return len(self.measured_gripper)
+
+    def content(self) -> dict[str, Any]:
+        """The arrays by name, for hashing."""
+        parts: dict[str, Any] = {
+            f.name: getattr(self, f.name) for f in dataclasses.fields(Steps) if f.name != "cameras"
+        }
+        for name, camera in self.cameras.items():
+            for part in dataclasses.fields(CameraRecord):
+                parts[f"cameras/{name}/{part.name}"] = getattr(camera, part.name)
+        return parts
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One demonstration: its 10 Hz steps, the simulated bodies, and all needed to start from any step.
+
+    `timestamps (T,)` [s]; `body_Ts_world` maps body names to `(T, 4, 4)` (empty on hardware);
+    `success (T,)` bool per step; `raw_commands (M, 7)`: the operator's 30 Hz tool velocity
+    (xyz [m/s], rotation [rad/s], tool frame) and gripper target; `states`: the backend's portable
+    state at each step (empty where it has none); `seconds`: wall-clock time the person spent.
+    """
+
+    task: str
+    task_parameters: Mapping[str, Any]
+    robot: str
+    backend: str
+    steps: Steps
+    timestamps: Array
+    body_Ts_world: Mapping[str, Array]
+    success: NDArray[np.bool_]
+    raw_commands: Array
+    states: tuple[bytes, ...]
+    operator: str
+    device: str
+    seconds: float
+    seed: int | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.steps)
+        if n < 2:
+            raise InvalidInput(f"demonstration: needs at least 2 steps, got {n}; record it again")
+        object.__setattr__(
+            self, "timestamps", frozen(check_array("timestamps", self.timestamps, (n,)))
+        )
+        object.__setattr__(
+            self, "raw_commands", frozen(check_array("raw_commands", self.raw_commands, (None, 7)))
+        )
+        success = np.asarray(self.success, dtype=bool)
+        if success.shape != (n,):
+            raise InvalidInput(f"success: expected shape ({n},), got {success.shape}")
+        object.__setattr__(self, "success", frozen(success))
+        bodies = {k: frozen(check_poses(k, v)) for k, v in self.body_Ts_world.items()}
+        object.__setattr__(self, "body_Ts_world", bodies)
+        if len(self.states) not in (0, n):
+            raise InvalidInput(f"states: expected none or {n}, got {len(self.states)}")
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    @property
+    def actions(self) -> Array:
+        """Actions `(T, 7)`, see `actions_from_commands`."""
+        return actions_from_commands(
+            self.steps.commanded_Ts_world_tool, self.steps.commanded_gripper
+        )
+
+    def content_hash(self) -> str:
+        """SHA-256 over what was shown: steps, commands, task and robot; not states or clock time."""
+        return digest(
+            {
+                **self.steps.content(),
+                "raw_commands": self.raw_commands,
+                "success": self.success,
+                "task": self.task,
+                "task_parameters": dict(self.task_parameters),
+                "robot": self.robot,
+            }
+        )
+
+
+@dataclass(frozen=True)
+class PrecisionSphere:
+    """How far the tool may stray around one key waypoint: radius [m] about `T_world_key (4,4)`.
+
+    `waypoint` is the index of the key waypoint in the demonstration. `clearance` [m] and
+    `limited_by` tell what backed a suggested radius: the distance of the pair of bodies that
+    bounds it.
+    """
+
+    waypoint: int
+    T_world_key: Array
+    radius: float
+    kind: Literal["ball", "free_space"] = "ball"
+    source: Literal["human", "suggested"] = "human"
+    clearance: float | None = None
+    limited_by: str | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.waypoint, bool) or int(self.waypoint) != self.waypoint:
+            raise InvalidInput(f"waypoint: expected a whole number, got {self.waypoint!r}")
+        if self.waypoint < 0:
+            raise InvalidInput(f"waypoint: expected an index >= 0, got {self.waypoint}")
+        if self.kind not in ("ball", "free_space"):
+            raise InvalidInput(f"kind: expected 'ball' or 'free_space', got {self.kind!r}")
+        if self.source not in ("human", "suggested"):
+            raise InvalidInput(f"source: expected 'human' or 'suggested', got {self.source!r}")
+        check_positive(f"radius of the sphere at waypoint {self.waypoint}", self.radius, "m")
+        object.__setattr__(self, "T_world_key", frozen(check_pose("T_world_key", self.T_world_key)))
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """The precision spheres of one demonstration, in order of their waypoints."""
+
+    spheres: tuple[PrecisionSphere, ...]
+    demonstration_hash: str
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.spheres:
+            raise InvalidInput("annotation: has no sphere; add at least one")
+        waypoints = [sphere.waypoint for sphere in self.spheres]
+        if sorted(set(waypoints)) != waypoints:
+            raise InvalidInput(
+                f"annotation: waypoints must increase without repeats, got {waypoints}; sort them"
+            )
+
+    def check_matches(self, demonstration: Demonstration) -> None:
+        """Return if the spheres were made for this demonstration.
+
+        Raises:
+            Mismatch: other demonstration, waypoint out of range, or key pose not at its waypoint.
+        """
+        if self.demonstration_hash != demonstration.content_hash():
+            raise Mismatch(
+                "annotation was made for another demonstration (hash "
+                f"{self.demonstration_hash[:12]}, this one has "
+                f"{demonstration.content_hash()[:12]}); annotate this one with `sart suggest`"
+            )
+        for sphere in self.spheres:
+            if sphere.waypoint >= len(demonstration) - 1:
+                raise Mismatch(
+                    f"sphere at waypoint {sphere.waypoint}: the demonstration's last waypoint to "
+                    f"start from is {len(demonstration) - 2}; choose an earlier one"
+                )
+            at = demonstration.steps.measured_Ts_world_tool[sphere.waypoint]
+            if not np.allclose(at, sphere.T_world_key, atol=1e-4):
+                raise Mismatch(
+                    f"sphere at waypoint {sphere.waypoint}: T_world_key differs from the measured "
+                    "tool pose there; keep it, and move the sphere by changing its waypoint"
+                )
+
+
+def convergence_waypoint(demonstration: Demonstration, sphere: PrecisionSphere) -> int:
+    """t*: the first waypoint after the key waypoint that lies outside its sphere (paper, Eq. t*).
+
+    Where the demonstration never leaves the sphere the last waypoint is taken, as the published
+    code does.
+    """
+    positions = demonstration.steps.measured_Ts_world_tool[:, :3, 3]
+    far = np.linalg.norm(positions - sphere.T_world_key[:3, 3], axis=1) > sphere.radius
+    outside = np.flatnonzero(far[sphere.waypoint + 1 :])
+    return sphere.waypoint + 1 + int(outside[0]) if len(outside) else len(demonstration) - 1
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a generated episode comes from: enough to generate it again."""
+
+    demonstration_hash: str
+    sphere: int
+    k: int
+    t_star: int
+    T_world_sampled: Array
+    seed: int
+    strategy: str
+    law: str
+    certificate: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        sampled = check_pose("T_world_sampled", self.T_world_sampled)
+        object.__setattr__(self, "T_world_sampled", frozen(sampled))
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One generated trajectory: the reversed segment's steps, then the demonstration from `t_star`.
+
+    The segment's last step is followed by the demonstration's step `provenance.t_star`; that
+    suffix is stored once, in the demonstration.
+    """
+
+    steps: Steps
+    provenance: Provenance
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def commands(self, demonstration: Demonstration) -> tuple[Array, Array]:
+        """Commanded tool poses `(n, 4, 4)` and gripper `(n,)` of the whole joined trajectory."""
+        t_star = self.provenance.t_star
+        suffix = demonstration.steps
+        return (
+            np.concatenate(
+                [self.steps.commanded_Ts_world_tool, suffix.commanded_Ts_world_tool[t_star:]]
+            ),
+            np.concatenate([self.steps.commanded_gripper, suffix.commanded_gripper[t_star:]]),
+        )
+
+    def actions(self, demonstration: Demonstration) -> Array:
+        """Actions `(n, 7)` of the whole joined trajectory, see `actions_from_commands`."""
+        return actions_from_commands(*self.commands(demonstration))
+
+    def content_hash(self) -> str:
+        """SHA-256 over the steps and their provenance."""
+        provenance = dataclasses.asdict(self.provenance)
+        provenance["T_world_sampled"] = self.provenance.T_world_sampled.tolist()
+        return digest({**self.steps.content(), "provenance": provenance})
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A demonstration, its annotation, and the episodes generated from them."""
+
+    demonstration: Demonstration
+    annotation: Annotation
+    episodes: tuple[Episode, ...]
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+    def content_hash(self) -> str:
+        """SHA-256 over the demonstration and every episode, in order."""
+        return digest(
+            {
+                "demonstration": self.demonstration.content_hash(),
+                "episodes": [episode.content_hash() for episode in self.episodes],
+            }
+        )

@@ -1,0 +1,158 @@
+"""Kinematics of a robot through Pinocchio: forward kinematics, Jacobian and inverse kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable, unknown_name
+from sart_toolkit.poses import Array, check_array, check_pose, frozen
+from sart_toolkit.robots.spec import Attachment, RobotSpec
+from sart_toolkit.robots.urdf import composed_urdf
+
+_IK_STEPS = 60
+_IK_DAMPING = 1e-4
+_IK_TOLERANCE = 1e-6
+_IK_MAX_STEP = 0.4
+
+
+class RobotModel:
+    """The kinematics of a robot, its gripper at a fixed opening and its base at the world's origin.
+
+    Joint vectors `q` are `(n,)` [rad] in the order of `spec.arm_joints`.
+
+    Attributes:
+        spec: the robot.
+        urdf: path of its composed URDF.
+        lower, upper: joint limits `(n,)` [rad].
+    """
+
+    def __init__(
+        self, spec: RobotSpec, held: Sequence[Attachment] = (), gripper: float = 0.0
+    ) -> None:
+        """Read the URDF.
+
+        Args:
+            spec: the robot.
+            held: bodies fixed to its frames.
+            gripper: gripper command in [0, 1] at which link poses are computed.
+        """
+        self.spec = spec
+        self.held = tuple(held)
+        self.gripper = float(gripper)
+        self.urdf = composed_urdf(spec, held)
+        full = pin.buildModelFromUrdf(str(self.urdf))
+        reference = pin.neutral(full)
+        for name, angle in spec.gripper.joint_angles(gripper).items():
+            reference[full.joints[full.getJointId(name)].idx_q] = angle
+        missing = [name for name in spec.arm_joints if not full.existJointName(name)]
+        if missing:
+            raise unknown_name("joint", missing[0], list(full.names)[1:])
+        locked = [
+            full.getJointId(name) for name in list(full.names)[1:] if name not in spec.arm_joints
+        ]
+        self._model = pin.buildReducedModel(full, locked, reference)
+        if list(self._model.names)[1:] != list(spec.arm_joints):
+            raise InvalidInput(
+                f"{spec.name}: arm_joints must be in the URDF's order "
+                f"{list(self._model.names)[1:]}, got {list(spec.arm_joints)}"
+            )
+        self._data = self._model.createData()
+        self._tool = self._frame(spec.tool_frame)
+        self.lower = frozen(self._model.lowerPositionLimit)
+        self.upper = frozen(self._model.upperPositionLimit)
+
+    @property
+    def pinocchio_model(self) -> pin.Model:
+        """The Pinocchio model of the arm, the gripper's joints locked."""
+        return self._model
+
+    def _frame(self, name: str) -> int:
+        if not self._model.existFrame(name):
+            raise unknown_name("frame", name, [f.name for f in self._model.frames])
+        return int(self._model.getFrameId(name))
+
+    def _check_q(self, q: Array) -> Array:
+        return check_array("q", q, (self._model.nq,))
+
+    def fk(self, q: Array, frame: str | None = None) -> Array:
+        """The pose `(4, 4)` of a frame (default: the tool) in the world at `q`.
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+            UnknownName: no such frame.
+        """
+        index = self._tool if frame is None else self._frame(frame)
+        pin.framesForwardKinematics(self._model, self._data, self._check_q(q))
+        return np.array(self._data.oMf[index].homogeneous)
+
+    def jacobian(self, q: Array, frame: str | None = None) -> Array:
+        """The Jacobian `(6, n)` of a frame: linear then angular velocity, in that frame's axes.
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+            UnknownName: no such frame.
+        """
+        index = self._tool if frame is None else self._frame(frame)
+        J = pin.computeFrameJacobian(
+            self._model, self._data, self._check_q(q), index, pin.ReferenceFrame.LOCAL
+        )
+        return np.array(J)
+
+    def ik(self, T_world_tool: Array, q_near: Array, max_step: float | None = None) -> Array:
+        """The joint configuration `(n,)` near `q_near` that puts the tool at a pose.
+
+        Damped least squares from `q_near`, within joint limits, to 1 µm and 1 µrad.
+
+        Args:
+            T_world_tool: desired tool pose `(4, 4)`.
+            q_near: where to start `(n,)`, the last command for instance.
+            max_step: reject an answer farther than this [rad] from `q_near` in any joint.
+
+        Raises:
+            InvalidInput: wrong shape or not a pose.
+            Unreachable: no configuration within limits was found.
+            MotionRejected: the answer is farther than `max_step`.
+        """
+        desired = pin.SE3(check_pose("T_world_tool", T_world_tool))
+        start = self._check_q(q_near)
+        q = np.clip(start, self.lower, self.upper)
+        model, data, tool = self._model, self._data, self._tool
+        eye = _IK_DAMPING**2 * np.eye(6)
+        error = np.zeros(6)
+        for _ in range(_IK_STEPS):
+            pin.computeJointJacobians(model, data, q)
+            pin.updateFramePlacement(model, data, tool)
+            J = pin.getFrameJacobian(model, data, tool, pin.ReferenceFrame.LOCAL)
+            error = pin.log6(data.oMf[tool].actInv(desired)).vector
+            if np.abs(error).max() < _IK_TOLERANCE:
+                break
+            dq = J.T @ np.linalg.solve(J @ J.T + eye, error)
+            largest = np.abs(dq).max()
+            if largest > _IK_MAX_STEP:
+                dq *= _IK_MAX_STEP / largest
+            q = np.clip(q + dq, self.lower, self.upper)
+        else:
+            p = ", ".join(f"{x:.3f}" for x in T_world_tool[:3, 3])
+            raise Unreachable(
+                f"tool pose at ({p}) m is out of reach: {np.linalg.norm(error[:3]) * 1e3:.1f} mm and "
+                f"{np.rad2deg(np.linalg.norm(error[3:])):.1f} deg remain within joint limits; "
+                "choose a pose nearer to the robot or another start"
+            )
+        step = float(np.abs(q - start).max())
+        if max_step is not None and step > max_step:
+            raise MotionRejected(
+                f"joint step of {step:.2f} rad exceeds {max_step:.2f} rad: the pose lies on another "
+                "branch or too far; move in smaller steps"
+            )
+        return q
+
+    def link_poses(self, q: Array) -> dict[str, Array]:
+        """Every frame's pose `(4, 4)` in the world at `q`, by name."""
+        pin.framesForwardKinematics(self._model, self._data, self._check_q(q))
+        return {
+            frame.name: np.array(self._data.oMf[i].homogeneous)
+            for i, frame in enumerate(self._model.frames)
+        }

@@ -1,0 +1,185 @@
+"""A robot as data: which URDFs, how they join, where the tool frame and the wrist camera are."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sart_toolkit.errors import InvalidInput, MissingExtra, MissingFile
+from sart_toolkit.poses import Array, check_array, check_pose, check_positive, frozen
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A convex primitive of a body: box, cylinder or sphere, at `T_body_shape (4,4)`.
+
+    `size` [m]: box (x, y, z) edge lengths; cylinder (radius, length along z); sphere (radius,).
+    `rgba` in [0, 1]. A shape with `collides` false is only drawn.
+    """
+
+    kind: Literal["box", "cylinder", "sphere"]
+    size: tuple[float, ...]
+    T_body_shape: Array = field(default_factory=lambda: np.eye(4))
+    rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+    collides: bool = True
+
+    def __post_init__(self) -> None:
+        lengths = {"box": 3, "cylinder": 2, "sphere": 1}
+        if self.kind not in lengths:
+            raise InvalidInput(f"shape kind: expected one of {sorted(lengths)}, got {self.kind!r}")
+        if len(self.size) != lengths[self.kind]:
+            raise InvalidInput(
+                f"{self.kind} size: expected {lengths[self.kind]} numbers, got {len(self.size)}"
+            )
+        for value in self.size:
+            check_positive(f"{self.kind} size", value, "m")
+        T = check_pose("T_body_shape", self.T_body_shape)
+        object.__setattr__(self, "T_body_shape", frozen(T))
+
+    def corners(self) -> Array:
+        """Points `(n, 3)` in the body frame whose convex hull encloses the shape."""
+        if self.kind == "box":
+            half = np.array(self.size) / 2
+        elif self.kind == "cylinder":
+            half = np.array([self.size[0], self.size[0], self.size[1] / 2])
+        else:
+            half = np.full(3, self.size[0])
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        return signs * half @ self.T_body_shape[:3, :3].T + self.T_body_shape[:3, 3]
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A rigid body fixed to a frame of the robot: what a gripper holds, or a camera's housing."""
+
+    name: str
+    frame: str
+    shapes: tuple[Shape, ...]
+    T_frame_body: Array = field(default_factory=lambda: np.eye(4))
+    mass: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_positive(f"mass of {self.name}", self.mass, "kg")
+        T = check_pose("T_frame_body", self.T_frame_body)
+        object.__setattr__(self, "T_frame_body", frozen(T))
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """An RGB-D camera on a frame of the robot, or in the world where `frame` is "world".
+
+    `T_frame_camera`: camera frame z forward, x right, y down. `fov_y_deg`: vertical field of view;
+    pictures are square-pixel, the horizontal field follows from the picture's shape.
+    """
+
+    name: str
+    frame: str
+    T_frame_camera: Array
+    fov_y_deg: float = 60.0
+    near: float = 0.02
+    far: float = 3.0
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.fov_y_deg <= 170.0:
+            raise InvalidInput(f"fov_y_deg: expected 1 to 170 degrees, got {self.fov_y_deg}")
+        T = check_pose("T_frame_camera", self.T_frame_camera)
+        object.__setattr__(self, "T_frame_camera", frozen(T))
+
+    def intrinsics(self, width: int, height: int) -> Array:
+        """The pinhole matrix `(3, 3)` [pixels] of a picture; the centre of pixel (0, 0) is (0, 0)."""
+        f = 0.5 * height / np.tan(0.5 * np.deg2rad(self.fov_y_deg))
+        return np.array([[f, 0, 0.5 * (width - 1)], [0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
+
+
+def look_at(p_camera: Array, p_target: Array, up: Array) -> Array:
+    """The camera pose `(4, 4)` at `p_camera` with its z axis through `p_target` and `up` upwards."""
+    z = np.asarray(p_target, float) - p_camera
+    z /= np.linalg.norm(z)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = x, np.cross(z, x), z, p_camera
+    return T
+
+
+@dataclass(frozen=True)
+class GripperSpec:
+    """A gripper: its URDF, its linkage, and what its one command means.
+
+    The command is 0 open, 1 closed. `driver` is the joint that the motor turns, from 0 to
+    `closed_angle` [rad]; `followers` maps each linked joint to its ratio to the driver.
+    `finger_links` are the links that may touch what is grasped; `force` [N m] bounds the driver.
+    """
+
+    urdf: str
+    parent_frame: str
+    driver: str
+    followers: Mapping[str, float]
+    closed_angle: float
+    finger_links: tuple[str, ...]
+    T_parent_gripper: Array = field(default_factory=lambda: np.eye(4))
+    force: float = 20.0
+    speed: float = 2.0
+
+    def joint_angles(self, command: float) -> dict[str, float]:
+        """Every linkage joint's angle [rad] at a command in [0, 1]."""
+        angle = self.closed_angle * command
+        return {self.driver: angle, **{name: angle * r for name, r in self.followers.items()}}
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """An arm with a gripper as data; everything else about it is derived from its URDFs.
+
+    `urdf` is `package:path/inside/it` or a path. Joint arrays follow `arm_joints`:
+    `home` [rad], `velocity_limits` [rad/s], `acceleration_limits` [rad/s²], `jerk_limits`
+    [rad/s³] (a URDF has no such entries). `T_gripper_tool`: the tool frame in the gripper's base,
+    z pointing out between the fingertips, x along the direction in which they close.
+    """
+
+    name: str
+    urdf: str
+    arm_joints: tuple[str, ...]
+    home: Array
+    velocity_limits: Array
+    acceleration_limits: Array
+    jerk_limits: Array
+    gripper: GripperSpec
+    gripper_base: str
+    T_gripper_tool: Array
+    wrist_camera: CameraSpec
+    attachments: tuple[Attachment, ...] = ()
+    link_colours: Mapping[str, tuple[float, float, float, float]] = field(default_factory=dict)
+    tool_frame: str = "tool"
+
+    def __post_init__(self) -> None:
+        n = len(self.arm_joints)
+        for name in ("home", "velocity_limits", "acceleration_limits", "jerk_limits"):
+            object.__setattr__(self, name, frozen(check_array(name, getattr(self, name), (n,))))
+        T = check_pose("T_gripper_tool", self.T_gripper_tool)
+        object.__setattr__(self, "T_gripper_tool", frozen(T))
+
+
+def resource_path(resource: str) -> Path:
+    """The file that `package:path/inside/it` or a plain path names.
+
+    Raises:
+        MissingExtra: the package isn't installed.
+        MissingFile: the file isn't there.
+    """
+    package, colon, inside = resource.partition(":")
+    if colon:
+        found = importlib.util.find_spec(package)
+        if found is None or found.origin is None:
+            raise MissingExtra(f"{resource}: package {package!r} missing; pip install {package}")
+        path = Path(found.origin).parent / inside
+    else:
+        path = Path(resource)
+    if not path.is_file():
+        raise MissingFile(f"{resource}: no such file ({path.name}); check the robot's urdf entries")
+    return path

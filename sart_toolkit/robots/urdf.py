@@ -1,0 +1,241 @@
+"""One URDF from an arm, a gripper and what is fixed to them, with light meshes, made once.
+
+Visual meshes are simplified, collision meshes become their convex hulls (which enclose them), and
+names get a prefix, so that any simulator and Pinocchio read the same small file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import fast_simplification
+import numpy as np
+import trimesh
+
+from sart_toolkit.errors import BrokenFile, InvalidInput
+from sart_toolkit.poses import Array
+from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape, resource_path
+
+# Bump when the composition changes, so that cached files of an older version are not used.
+_RECIPE = 4
+_VISUAL_FACES = 500
+_GRIPPER_PREFIX = "gripper_"
+
+
+def cache_dir() -> Path:
+    """Where derived files are kept: `$SART_CACHE`, or the user's cache directory."""
+    root = os.environ.get("SART_CACHE") or os.environ.get("XDG_CACHE_HOME")
+    return Path(root or Path.home() / ".cache") / "sart_toolkit"
+
+
+def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
+    """The path of the robot's single URDF, with the held bodies fixed on; made once, then cached.
+
+    Raises:
+        MissingExtra, MissingFile: a source URDF isn't there.
+        BrokenFile: a source URDF can't be parsed.
+        InvalidInput: two links or joints have the same name.
+    """
+    sources = [resource_path(spec.urdf), resource_path(spec.gripper.urdf)]
+    attachments = [*spec.attachments, *held]
+    key = hashlib.sha256(
+        json.dumps(
+            {
+                "recipe": _RECIPE,
+                "faces": _VISUAL_FACES,
+                "sources": [(str(p), p.stat().st_size, p.stat().st_mtime) for p in sources],
+                "spec": _plain(spec),
+                "attachments": _plain(attachments),
+            },
+            sort_keys=True,
+        ).encode()
+    ).hexdigest()[:16]
+    directory = cache_dir() / f"{spec.name}-{key}"
+    urdf = directory / "robot.urdf"
+    if not urdf.exists():
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(dir=directory.parent, prefix=f".{spec.name}-"))
+        try:
+            _compose(spec, attachments, sources, work)
+            try:
+                os.replace(work, directory)
+            except OSError:
+                # Another process has just put the same files there.
+                if not urdf.exists():
+                    raise
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    return urdf
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value
+
+
+def _compose(
+    spec: RobotSpec, attachments: Sequence[Attachment], sources: list[Path], work: Path
+) -> None:
+    robot = ET.Element("robot", name=spec.name)
+    for source, prefix in zip(sources, ("", _GRIPPER_PREFIX), strict=True):
+        for element in _elements(source, prefix):
+            robot.append(element)
+            if element.tag == "link":
+                _lighten(element, source.parent, work, spec)
+    _fix(robot, spec.gripper.parent_frame, spec.gripper_base, spec.gripper.T_parent_gripper)
+    robot.append(ET.Element("link", name=spec.tool_frame))
+    _fix(robot, spec.gripper_base, spec.tool_frame, spec.T_gripper_tool)
+    for attachment in attachments:
+        robot.append(_attachment_link(attachment))
+        _fix(robot, attachment.frame, attachment.name, attachment.T_frame_body)
+    for kind in ("link", "joint"):
+        names = [element.get("name") for element in robot.findall(kind)]
+        twice = sorted({str(name) for name in names if names.count(name) > 1})
+        if twice:
+            raise InvalidInput(f"{spec.name}: two {kind}s are called {twice[0]!r}; rename one")
+    for link in robot.findall("link"):
+        if link.find("inertial") is None:
+            # A simulator would give a link without inertia one kilogram.
+            link.append(_inertial(1e-3, np.full(3, 1e-6)))
+    ET.indent(robot)
+    ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)
+
+
+def _elements(source: Path, prefix: str) -> list[ET.Element]:
+    """Links and joints of a URDF, names prefixed, vendor extensions left out."""
+    text = source.read_text()
+    # airo-models uses the prefix drake: without declaring it, which no XML parser accepts.
+    text = re.sub(r"<(drake:\w+)\b.*?</\1>", "", text, flags=re.DOTALL)
+    text = re.sub(r"\sdrake:\w+=\"[^\"]*\"", "", text)
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise BrokenFile(f"{source.name}: not a readable URDF ({error}); check the file") from error
+    kept = [element for element in root if element.tag in ("link", "joint")]
+    for element in kept:
+        element.set("name", prefix + element.get("name", ""))
+        for tag, attribute in (("parent", "link"), ("child", "link"), ("mimic", "joint")):
+            for child in element.findall(tag):
+                child.set(attribute, prefix + child.get(attribute, ""))
+    return kept
+
+
+def _lighten(link: ET.Element, base: Path, work: Path, spec: RobotSpec) -> None:
+    """Replace the link's meshes: visuals simplified, collisions by their convex hull."""
+    name = link.get("name", "")
+    for kind in ("visual", "collision"):
+        for index, element in enumerate(link.findall(kind)):
+            colour = spec.link_colours.get(name, (0.6, 0.6, 0.62, 1.0))
+            for material in element.findall("material"):
+                element.remove(material)
+            if kind == "visual":
+                element.append(_material(f"{name}_{index}", colour))
+            mesh = element.find("geometry/mesh")
+            if mesh is None:
+                continue
+            source = (base / mesh.get("filename", "")).resolve()
+            if not source.is_file():
+                raise BrokenFile(f"{name}: mesh {source.name} is missing; reinstall its package")
+            loaded = trimesh.load(source, force="mesh", process=True)
+            loaded.merge_vertices(merge_tex=True, merge_norm=True)
+            scale = np.array([float(s) for s in mesh.get("scale", "1 1 1").split()])
+            loaded.apply_scale(scale)
+            light = _simplified(loaded) if kind == "visual" else loaded.convex_hull
+            file = f"{name}_{kind}_{index}.obj"
+            light.export(work / file, include_normals=False, include_texture=False)
+            mesh.set("filename", file)
+            mesh.attrib.pop("scale", None)
+
+
+def _simplified(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    if len(mesh.faces) <= _VISUAL_FACES:
+        return mesh
+    vertices, faces = fast_simplification.simplify(
+        np.asarray(mesh.vertices, np.float32),
+        np.asarray(mesh.faces, np.int32),
+        target_count=_VISUAL_FACES,
+    )
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _origin(T: Array) -> ET.Element:
+    R = T[:3, :3]
+    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
+    if np.cos(pitch) > 1e-6:
+        roll, yaw = np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0])
+    else:
+        roll, yaw = np.arctan2(-R[1, 2], R[1, 1]), 0.0
+    return ET.Element("origin", xyz=_numbers(T[:3, 3]), rpy=_numbers([roll, pitch, yaw]))
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{float(v):.12g}" for v in values)
+
+
+def _material(name: str, rgba: tuple[float, ...]) -> ET.Element:
+    material = ET.Element("material", name=f"{name}_colour")
+    ET.SubElement(material, "color", rgba=_numbers(rgba))
+    return material
+
+
+def _inertial(mass: float, diagonal: Array, p: Sequence[float] = (0, 0, 0)) -> ET.Element:
+    inertial = ET.Element("inertial")
+    ET.SubElement(inertial, "origin", xyz=_numbers(p), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=f"{mass:.9g}")
+    ixx, iyy, izz = (f"{d:.9g}" for d in diagonal)
+    ET.SubElement(inertial, "inertia", ixx=ixx, ixy="0", ixz="0", iyy=iyy, iyz="0", izz=izz)
+    return inertial
+
+
+def _fix(robot: ET.Element, parent: str, child: str, T_parent_child: Array) -> None:
+    joint = ET.SubElement(robot, "joint", name=f"{child}_fixed", type="fixed")
+    joint.append(_origin(T_parent_child))
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+
+
+def _attachment_link(attachment: Attachment) -> ET.Element:
+    link = ET.Element("link", name=attachment.name)
+    points = np.concatenate([shape.corners() for shape in attachment.shapes])
+    low, high = points.min(0), points.max(0)
+    edges = high - low
+    # The inertia of a box around the shapes: right for a box, and close enough for the rest.
+    diagonal = attachment.mass / 12 * (np.sum(edges**2) - edges**2)
+    link.append(_inertial(attachment.mass, diagonal, (low + high) / 2))
+    for index, shape in enumerate(attachment.shapes):
+        for kind in ("visual", "collision") if shape.collides else ("visual",):
+            element = ET.SubElement(link, kind)
+            element.append(_origin(shape.T_body_shape))
+            element.append(_geometry(shape))
+            if kind == "visual":
+                element.append(_material(f"{attachment.name}_{index}", shape.rgba))
+    return link
+
+
+def _geometry(shape: Shape) -> ET.Element:
+    geometry = ET.Element("geometry")
+    if shape.kind == "box":
+        ET.SubElement(geometry, "box", size=_numbers(shape.size))
+    elif shape.kind == "cylinder":
+        radius, length = (f"{v:.9g}" for v in shape.size)
+        ET.SubElement(geometry, "cylinder", radius=radius, length=length)
+    else:
+        ET.SubElement(geometry, "sphere", radius=f"{shape.size[0]:.9g}")
+    return geometry

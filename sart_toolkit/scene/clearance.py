@@ -1,0 +1,196 @@
+"""How far the robot's bodies are from the scene and from each other, by coal, pair by pair."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from sart_toolkit.errors import InvalidInput, unknown_name
+from sart_toolkit.poses import Array, inverse
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import Shape
+from sart_toolkit.scene.spec import SceneSpec
+
+
+@dataclass(frozen=True)
+class PairDistance:
+    """Distance [m] between two bodies, by name; negative where they overlap."""
+
+    a: str
+    b: str
+    distance: float
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One convex part of a link: its geometry and its pose in the joint that carries it."""
+
+    link: str
+    joint: int
+    geometry: coal.CollisionGeometry
+    T_joint_part: Array
+    points: Array
+
+
+class ClearanceModel:
+    """Distances between the robot's convex parts, and between them and a scene's shapes.
+
+    The *tool bodies* are the parts that the last arm joint carries: gripper, camera, held objects.
+    The *arm bodies* are the others, those that no joint moves left out.
+
+    Attributes:
+        tool_reach: for each tool body, the distance [m] of its farthest point from the tool frame.
+    """
+
+    def __init__(self, model: RobotModel, scene: SceneSpec) -> None:
+        """Read the collision geometry of the robot (its gripper as in `model`) and of the scene."""
+        self.model = model
+        self.scene = scene
+        pinocchio_model = model.pinocchio_model
+        self._data = pinocchio_model.createData()
+        last = pinocchio_model.njoints - 1
+        parts = [part for part in _robot_parts(model) if part.joint > 0]
+        self._tool = [part for part in parts if part.joint == last]
+        self._arm = [part for part in parts if part.joint < last]
+        # The last three joints of an arm share its wrist, whose links neighbour the tool.
+        self._arm_apart = [part for part in self._arm if part.joint <= last - 3]
+        self._shapes = [
+            (body.name, _geometry(shape), shape.T_body_shape)
+            for body in scene.bodies
+            for shape in body.shapes
+            if shape.collides
+        ]
+        T_joint_tool = inverse(self._joint_poses(model.spec.home)[last]) @ model.fk(model.spec.home)
+        p_tool = T_joint_tool[:3, 3]
+        self.tool_reach = {
+            i: float(np.linalg.norm(part.points - p_tool, axis=1).max())
+            for i, part in enumerate(self._tool)
+        }
+
+    def _joint_poses(self, q: Array) -> list[Array]:
+        pin.forwardKinematics(self.model.pinocchio_model, self._data, np.asarray(q, float))
+        return [np.array(T.homogeneous) for T in self._data.oMi]
+
+    def _placed_scene(
+        self, Ts_world_body: Mapping[str, Array]
+    ) -> list[tuple[str, coal.CollisionGeometry, coal.Transform3s]]:
+        for name, _, _ in self._shapes:
+            if name not in Ts_world_body:
+                raise unknown_name("body", name, Ts_world_body)
+        return [
+            (name, geometry, _transform(Ts_world_body[name] @ T))
+            for name, geometry, T in self._shapes
+        ]
+
+    def tool_distances(
+        self, q: Array, Ts_world_body: Mapping[str, Array]
+    ) -> dict[int, PairDistance]:
+        """For each tool body, by index, its nearest body of the scene at `q (n,)`.
+
+        Args:
+            q: joint configuration [rad].
+            Ts_world_body: poses `(4, 4)` of the scene's bodies.
+
+        Raises:
+            UnknownName: a body's pose is missing.
+        """
+        joints = self._joint_poses(q)
+        scene = self._placed_scene(Ts_world_body)
+        nearest = {}
+        for i, part in enumerate(self._tool):
+            T = _transform(joints[part.joint] @ part.T_joint_part)
+            pairs = [
+                PairDistance(part.link, name, _distance(part.geometry, T, geometry, T_shape))
+                for name, geometry, T_shape in scene
+            ]
+            nearest[i] = min(pairs, key=lambda pair: pair.distance)
+        return nearest
+
+    def arm_distance(self, q: Array, Ts_world_body: Mapping[str, Array]) -> PairDistance:
+        """The nearest pair at `q (n,)` among arm against scene and tool against arm.
+
+        Raises:
+            UnknownName: a body's pose is missing.
+        """
+        joints = self._joint_poses(q)
+        scene = self._placed_scene(Ts_world_body)
+        placed = {
+            id(part): _transform(joints[part.joint] @ part.T_joint_part)
+            for part in (*self._arm, *self._tool)
+        }
+        best = PairDistance("", "", np.inf)
+        for part in self._arm:
+            for name, geometry, T in scene:
+                distance = _distance(part.geometry, placed[id(part)], geometry, T)
+                if distance < best.distance:
+                    best = PairDistance(part.link, name, distance)
+        for part in self._tool:
+            for other in self._arm_apart:
+                distance = _distance(
+                    part.geometry, placed[id(part)], other.geometry, placed[id(other)]
+                )
+                if distance < best.distance:
+                    best = PairDistance(part.link, other.link, distance)
+        return best
+
+
+def _robot_parts(model: RobotModel) -> list[_Part]:
+    pinocchio_model = model.pinocchio_model
+    loaded = pin.buildGeomFromUrdf(
+        pinocchio_model, str(model.urdf), pin.GeometryType.COLLISION, package_dirs=str(model.urdf.parent)
+    )
+    parts = []
+    for item in loaded.geometryObjects:
+        geometry = item.geometry
+        if isinstance(geometry, coal.BVHModelBase):
+            geometry.buildConvexHull(True, "Qt")
+            geometry = geometry.convex
+        frame = pinocchio_model.frames[item.parentFrame]
+        T = np.array(item.placement.homogeneous)
+        points = _points(geometry) @ T[:3, :3].T + T[:3, 3]
+        parts.append(_Part(frame.name, int(item.parentJoint), geometry, T, points))
+    return parts
+
+
+def _points(geometry: coal.CollisionGeometry) -> Array:
+    """Points `(n, 3)` whose convex hull encloses a convex geometry."""
+    if isinstance(geometry, coal.ConvexBase):
+        return np.array(geometry.points()).reshape(-1, 3)
+    if isinstance(geometry, coal.Box):
+        size: Sequence[float] = 2 * np.array(geometry.halfSide)
+        return Shape("box", tuple(size)).corners()
+    if isinstance(geometry, coal.Sphere):
+        return Shape("sphere", (geometry.radius,)).corners()
+    if isinstance(geometry, coal.Cylinder):
+        return Shape("cylinder", (geometry.radius, 2 * geometry.halfLength)).corners()
+    raise InvalidInput(
+        f"collision geometry {type(geometry).__name__} is not convex; use meshes, boxes, spheres or "
+        "cylinders in the URDF"
+    )
+
+
+def _geometry(shape: Shape) -> coal.CollisionGeometry:
+    if shape.kind == "box":
+        return coal.Box(*shape.size)
+    if shape.kind == "sphere":
+        return coal.Sphere(*shape.size)
+    return coal.Cylinder(*shape.size)
+
+
+def _transform(T: Array) -> coal.Transform3s:
+    return coal.Transform3s(T[:3, :3], T[:3, 3])
+
+
+def _distance(
+    a: coal.CollisionGeometry,
+    T_a: coal.Transform3s,
+    b: coal.CollisionGeometry,
+    T_b: coal.Transform3s,
+) -> float:
+    # A result that is not new keeps the smallest distance it has seen.
+    result = coal.DistanceResult()
+    return float(coal.distance(a, T_a, b, T_b, coal.DistanceRequest(), result))

@@ -1,0 +1,29 @@
+"""Tasks: one file each with its scene, randomisation, success test and operator's plan.
+
+A new task is one file and one line in `TASKS`.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+from sart_toolkit.errors import unknown_name
+from sart_toolkit.tasks.task import Task
+
+TASKS = {
+    "peg_in_hole": "sart_toolkit.tasks.peg_in_hole:PegInHole",
+}
+
+
+def get_task(name: str) -> Task:
+    """The task called `name`.
+
+    Raises:
+        UnknownName: no such task; the message offers the nearest.
+    """
+    if name not in TASKS:
+        raise unknown_name("task", name, TASKS)
+    module, attribute = TASKS[name].split(":")
+    task = getattr(importlib.import_module(module), attribute)()
+    assert isinstance(task, Task)
+    return task

@@ -1,0 +1,135 @@
+"""Peg-in-hole: lower a held square peg into a square hole."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sart_toolkit.backends.interface import Observation
+from sart_toolkit.poses import Array, inverse, pose
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, look_at
+from sart_toolkit.scene.spec import Body, SceneSpec, SceneState
+from sart_toolkit.tasks.task import Placement, Stage, Task
+
+PEG_WIDTH, PEG_LENGTH = 0.03, 0.08
+HOLE_WIDTH, HOLE_DEPTH = 0.05, 0.04
+_BLOCK_WIDTH = 0.11
+_PEG_TIP_BELOW_TOOL = 0.06
+_START_CLEARANCE = 0.125
+_INSERTION = 0.03
+_MIDDLE = np.array([0.50, 0.0, 0.0])
+_GRIPPER = 0.67
+_TABLE = (0.55, 0.50, 0.44, 1.0)
+_WOOD = (0.86, 0.62, 0.30, 1.0)
+_PEG = (0.20, 0.45, 0.80, 1.0)
+
+
+def _block() -> Body:
+    """Four walls around a square hole; origin at the hole's centre on the table."""
+    wall = (_BLOCK_WIDTH - HOLE_WIDTH) / 2
+    middle = (HOLE_WIDTH + wall) / 2
+    z = HOLE_DEPTH / 2
+    long, short = (wall, _BLOCK_WIDTH, HOLE_DEPTH), (HOLE_WIDTH, wall, HOLE_DEPTH)
+    walls = [
+        Shape("box", size, pose([x, y, z]), _WOOD)
+        for size, x, y in ((long, middle, 0), (long, -middle, 0), (short, 0, middle), (short, 0, -middle))
+    ]
+    # The floor of the hole is only drawn darker; the table carries the peg.
+    floor = Shape(
+        "box", (HOLE_WIDTH, HOLE_WIDTH, 0.001), pose([0, 0, 0.0005]), (0.12, 0.10, 0.09, 1), False
+    )
+    return Body("block", (*walls, floor))
+
+
+class PegInHole(Task):
+    """Lower a 3 cm square peg, fixed to the gripper, into a 5 cm square hole, 4 cm deep.
+
+    Goal: the peg stands in the hole.
+    Randomisation: the block with the hole is placed uniformly within ±5 cm in x and y of (0.50, 0)
+    m; nothing else moves. The robot starts with the peg's tip 12.5 cm above the block, over the
+    middle of the range.
+    Success: in the hole's frame the peg's tip is |dx|, |dy| < 12 mm from the axis, at least 20 mm
+    below the rim (half the hole's depth), and the peg is tilted < 10 deg.
+    """
+
+    name = "peg_in_hole"
+    robot = "ur5e_2f85"
+    placement_range = 0.05
+    horizon = 15.0
+    report_body = "block"
+    scene = SceneSpec(
+        bodies=(
+            Body(
+                "table",
+                (Shape("box", (4.0, 4.0, 0.1), pose([0.5, 0, -0.05]), _TABLE),),
+            ),
+            _block(),
+        ),
+        held=(
+            Attachment(
+                "peg",
+                "tool",
+                (Shape("box", (PEG_WIDTH, PEG_WIDTH, PEG_LENGTH), rgba=_PEG),),
+                pose([0, 0, _PEG_TIP_BELOW_TOOL - PEG_LENGTH / 2]),
+                mass=0.1,
+            ),
+        ),
+        cameras=(
+            CameraSpec(
+                "overview",
+                "world",
+                look_at(np.array([1.15, -0.62, 0.52]), np.array([0.42, 0.02, 0.14]), np.array([0, 0, 1.0])),
+                fov_y_deg=42.0,
+                near=0.05,
+                far=6.0,
+            ),
+        ),
+    )
+
+    @staticmethod
+    def _start() -> Array:
+        """The tool's pose at the start: pointing down, the camera on the robot's side."""
+        z = HOLE_DEPTH + _START_CLEARANCE + _PEG_TIP_BELOW_TOOL
+        T = np.eye(4)
+        T[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+        T[:3, 3] = _MIDDLE + [0, 0, z]
+        return T
+
+    def initial_state(self, model: RobotModel, placement: Placement) -> SceneState:
+        q = model.ik(self._start(), model.spec.home)
+        T_world_block = pose(_MIDDLE) @ placement.T_middle_object
+        return self.scene.initial_state(q, _GRIPPER, {"block": T_world_block})
+
+    def _peg_in_hole(self, observation: Observation) -> tuple[Array, float]:
+        """The peg tip's position `(3,)` [m] from the rim's centre, and the peg's tilt [rad]."""
+        Ts = observation.Ts_world_body
+        T_hole_peg = inverse(Ts["block"] @ pose([0, 0, HOLE_DEPTH])) @ Ts["peg"]
+        tip = (T_hole_peg @ np.array([0, 0, PEG_LENGTH / 2, 1.0]))[:3]
+        axis = T_hole_peg[:3, 2]
+        return tip, float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
+
+    def success(self, observation: Observation) -> bool:
+        tip, tilt = self._peg_in_hole(observation)
+        inside = bool(np.abs(tip[:2]).max() < 0.012)
+        return inside and tip[2] < -HOLE_DEPTH / 2 and tilt < np.deg2rad(10)
+
+    def shortfall(self, observation: Observation) -> str:
+        tip, tilt = self._peg_in_hole(observation)
+        if np.rad2deg(tilt) >= 10:
+            return f"peg tilted {np.rad2deg(tilt):.0f} deg"
+        beside = float(np.abs(tip[:2]).max())
+        if beside >= 0.012:
+            return f"peg {beside * 1e3:.0f} mm beside the hole's axis, tip {tip[2] * 1e3:+.0f} mm of rim"
+        return f"peg over the hole but only {-tip[2] * 1e3:.0f} mm deep"
+
+    def plan(self, state: SceneState) -> list[Stage]:
+        hole = state.Ts_world_body["block"]
+        T = self._start()
+        T[:3, :3] = hole[:3, :3] @ T[:3, :3]
+        legs = []
+        for tip_height, speed, tolerance in ((0.012, 0.07, 0.004), (-_INSERTION, 0.03, 0.003)):
+            T_leg = T.copy()
+            T_leg[:3, 3] = hole[:3, 3] + [0, 0, HOLE_DEPTH + tip_height + _PEG_TIP_BELOW_TOOL]
+            legs.append(Stage(T_leg, _GRIPPER, speed, tolerance))
+        return legs
+

@@ -1,0 +1,110 @@
+"""What a task is: scene, placements, success, and the plan that a scripted operator follows."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from sart_toolkit.backends.interface import Observation
+from sart_toolkit.errors import InvalidInput
+from sart_toolkit.poses import Array, pose
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.spec import SceneSpec, SceneState
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the task's object stands on the table relative to the middle of its range.
+
+    `x`, `y` [m], `yaw_deg` [deg] about the vertical.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw_deg: float = 0.0
+
+    @property
+    def T_middle_object(self) -> Array:
+        """The object's pose `(4, 4)` in the frame at the middle of the range."""
+        return pose([self.x, self.y, 0.0], [0.0, 0.0, np.deg2rad(self.yaw_deg)])
+
+    def to_json(self) -> dict[str, float]:
+        """The placement as JSON values."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> Placement:
+        """The placement from JSON values.
+
+        Raises:
+            InvalidInput: a field is unknown or not a finite number.
+        """
+        try:
+            placement = Placement(**{k: float(v) for k, v in value.items()})
+        except (TypeError, ValueError) as error:
+            raise InvalidInput(f"placement: expected x, y, yaw_deg, got {value!r}") from error
+        if not np.isfinite([placement.x, placement.y, placement.yaw_deg]).all():
+            raise InvalidInput(f"placement: has a NaN or infinite entry: {value!r}")
+        return placement
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One leg of an operator's plan: steer the tool to `T_world_tool (4,4)`, then go on.
+
+    The leg ends when the tool is within `tolerance` [m] and `tolerance_deg`. `speed` [m/s] is what
+    a person would choose there; `gripper` is the command held throughout.
+    """
+
+    T_world_tool: Array
+    gripper: float
+    speed: float
+    tolerance: float = 0.003
+    tolerance_deg: float = 2.0
+
+
+class Task(abc.ABC):
+    """A skill to be learned, told without naming a simulator.
+
+    Attributes:
+        name: as in `TASKS`.
+        robot: the robot it is made for.
+        scene: bodies, held bodies and fixed cameras.
+        placement_range: half width [m] of the square that the object is placed in.
+        horizon: longest rollout [s].
+        hold: how long [s] success must last before a rollout ends early.
+        report_body: the body whose placement varies.
+    """
+
+    name: str
+    robot: str
+    scene: SceneSpec
+    placement_range: float
+    horizon: float
+    hold: float = 1.0
+    report_body: str
+
+    @abc.abstractmethod
+    def initial_state(self, model: RobotModel, placement: Placement) -> SceneState:
+        """Robot and bodies at rest at the start, the object at `placement`."""
+
+    @abc.abstractmethod
+    def success(self, observation: Observation) -> bool:
+        """Whether the goal is reached now, measured from the simulated bodies."""
+
+    @abc.abstractmethod
+    def shortfall(self, observation: Observation) -> str:
+        """Why the goal isn't reached now, in a few words with numbers."""
+
+    @abc.abstractmethod
+    def plan(self, state: SceneState) -> list[Stage]:
+        """The legs by which a person would steer the tool from the start to the goal."""
+
+    def sample_placement(self, rng: np.random.Generator) -> Placement:
+        """A placement drawn uniformly from the square of half width `placement_range`."""
+        x, y = rng.uniform(-self.placement_range, self.placement_range, size=2)
+        return Placement(float(x), float(y))

@@ -1,0 +1,1 @@
+"""Teaching: teleoperation and its recorder, scripted operators, and radius suggestion."""

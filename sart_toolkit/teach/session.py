@@ -1,0 +1,165 @@
+"""Teleoperation: a device steers the tool at 30 Hz, the session records at 10 Hz."""
+
+from __future__ import annotations
+
+import abc
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sart_toolkit.backends.interface import Backend, Observation
+from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
+from sart_toolkit.motion.controller import ControllerConfig, ToolController
+from sart_toolkit.poses import Array, apply_motion, check_array, check_positive, frozen
+from sart_toolkit.records import (
+    CONTROL_HZ,
+    CONTROL_PER_RECORD,
+    RECORD_HZ,
+    Demonstration,
+    library_versions,
+)
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.teach.recorder import StepRecorder
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TeleopCommand:
+    """What a device asks for over the next 1/30 s.
+
+    `velocity (6,)`: of the tool in the tool's frame, xyz [m/s] and rotation [rad/s]; `gripper` in
+    [0, 1]; `stop` ends the recording before the command is carried out.
+    """
+
+    velocity: Array
+    gripper: float
+    stop: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "velocity", frozen(check_array("velocity", self.velocity, (6,))))
+        if not 0.0 <= self.gripper <= 1.0:
+            raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {self.gripper}")
+
+
+class Device(abc.ABC):
+    """What a person, or a script in a person's place, steers with.
+
+    Attributes:
+        name: kept with the demonstration.
+        operator: who steers.
+    """
+
+    name: str
+    operator: str
+
+    @abc.abstractmethod
+    def read(self, observation: Observation) -> TeleopCommand:
+        """The command for the next 1/30 s, having seen what the robot measures now."""
+
+
+@dataclass(frozen=True)
+class SessionConfig:
+    """How a demonstration is recorded: cameras, and the longest it may last [s]."""
+
+    cameras: tuple[str, ...] = ("wrist",)
+    max_seconds: float = 120.0
+
+    def __post_init__(self) -> None:
+        check_positive("max_seconds", self.max_seconds, "s")
+
+
+def record_demonstration(
+    backend: Backend,
+    task: Task,
+    model: RobotModel,
+    device: Device,
+    placement: Placement,
+    seed: int | None = None,
+    config: SessionConfig | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Demonstration:
+    """One demonstration of a task, steered by a device until it says stop.
+
+    A command that leads out of reach is not carried out: the tool stays where it is.
+
+    Args:
+        backend: the robot in the task's scene.
+        task: what is demonstrated.
+        model: the robot's kinematics.
+        device: what steers.
+        placement: where the object stands.
+        seed: the device's seed, kept with the demonstration.
+        config: cameras and limits.
+        progress: called with the seconds recorded so far.
+
+    Raises:
+        InvalidInput: the device did not stop within `max_seconds`.
+    """
+    config = config or SessionConfig()
+    controller = ToolController(model, ControllerConfig())
+    state = task.initial_state(model, placement)
+    backend.reset(state)
+    controller.reset(state.q)
+    recorder = StepRecorder(backend, config.cameras)
+    gripper = state.gripper
+    observation = recorder.add(controller, gripper, 0.0)
+    can_save, feels = backend.capabilities.can_restore, backend.capabilities.has_contacts
+    states = [backend.save()] if can_save else []
+    success, raw = [task.success(observation)], []
+    stop = False
+    while not stop:
+        if len(states or success) > config.max_seconds * RECORD_HZ:
+            raise InvalidInput(
+                f"the demonstration did not end within {config.max_seconds:.0f} s: "
+                f"{task.shortfall(observation)}; steer on, or allow more with max_seconds"
+            )
+        force = 0.0 if feels else np.nan
+        for _ in range(CONTROL_PER_RECORD):
+            now = backend.observe()
+            command = device.read(now)
+            stop = stop or command.stop
+            velocity = np.zeros(6) if stop else command.velocity
+            gripper = command.gripper
+            raw.append(np.append(velocity, gripper))
+            desired = apply_motion(controller.commanded_T_world_tool, velocity / CONTROL_HZ)
+            try:
+                q = controller.move(desired, now.T_world_tool, 1)[0]
+            except (Unreachable, MotionRejected) as error:
+                _log.warning("command not carried out: %s", error)
+                q = controller.commanded_q
+            backend.command(q, gripper)
+            backend.step()
+            if feels:
+                force = max([force, *(contact.force for contact in backend.contacts())])
+        observation = recorder.add(controller, gripper, force)
+        if can_save:
+            states.append(backend.save())
+        success.append(task.success(observation))
+        if progress is not None:
+            progress(len(success) / RECORD_HZ)
+    steps = recorder.steps()
+    rows = recorder.observations
+    return Demonstration(
+        task=task.name,
+        task_parameters={"placement": placement.to_json()},
+        robot=model.spec.name,
+        backend=backend.name,
+        steps=steps,
+        timestamps=np.arange(len(steps)) / RECORD_HZ,
+        body_Ts_world={
+            name: np.stack([row.Ts_world_body[name] for row in rows])
+            for name in rows[0].Ts_world_body
+        },
+        success=np.array(success),
+        raw_commands=np.stack(raw),
+        states=tuple(states),
+        operator=device.operator,
+        device=device.name,
+        seconds=len(steps) / RECORD_HZ,
+        seed=seed,
+        versions=library_versions(),
+    )
