@@ -85,7 +85,9 @@ def check_positive(name: str, value: float, unit: str = "") -> float:
     """
     number = float(value)
     if not np.isfinite(number) or number <= 0:
-        raise InvalidInput(f"{name}: expected a finite number > 0{unit and ' ' + unit}, got {value}")
+        raise InvalidInput(
+            f"{name}: expected a finite number > 0{unit and ' ' + unit}, got {value}"
+        )
     return number
 
 
@@ -150,7 +152,7 @@ def log_rotation(R: Array) -> Array:
 
 
 def relative_motion(T_world_from: Array, T_world_to: Array) -> Array:
-    """The motion `(6,)` xyz [m], rotation vector [rad], in the first pose's frame, between two poses.
+    """The motion `(6,)` between poses: xyz [m], rotation vector [rad], in the first one's frame.
 
     `apply_motion(T_world_from, relative_motion(T_world_from, T_world_to))` is `T_world_to`.
     """

@@ -140,7 +140,9 @@ class Steps:
     def __post_init__(self) -> None:
         n = len(self.measured_gripper)
         for name in ("joint_positions", "joint_velocities", "commanded_joint_positions"):
-            object.__setattr__(self, name, frozen(check_array(name, getattr(self, name), (n, None))))
+            object.__setattr__(
+                self, name, frozen(check_array(name, getattr(self, name), (n, None)))
+            )
         for name in ("measured_Ts_world_tool", "commanded_Ts_world_tool"):
             poses = check_poses(name, getattr(self, name))
             if len(poses) != n:
@@ -173,7 +175,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One demonstration: its 10 Hz steps, the simulated bodies, and all needed to start from any step.
+    """One demonstration: its 10 Hz steps, the bodies, and what it takes to start from any step.
 
     `timestamps (T,)` [s]; `body_Ts_world` maps body names to `(T, 4, 4)` (empty on hardware);
     `success (T,)` bool per step; `raw_commands (M, 7)`: the operator's 30 Hz tool velocity
@@ -227,7 +229,7 @@ class Demonstration:
         )
 
     def content_hash(self) -> str:
-        """SHA-256 over what was shown: steps, commands, task and robot; not states or clock time."""
+        """SHA-256 over what was shown: steps, commands, task, robot; not states or clock time."""
         return digest(
             {
                 **self.steps.content(),
@@ -272,11 +274,15 @@ class PrecisionSphere:
 
 @dataclass(frozen=True)
 class Annotation:
-    """The precision spheres of one demonstration, in order of their waypoints."""
+    """The precision spheres of one demonstration, in order of their waypoints.
+
+    `seconds`: wall-clock time a person spent; `settings`: how suggested radii were found.
+    """
 
     spheres: tuple[PrecisionSphere, ...]
     demonstration_hash: str
     seconds: float = 0.0
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.spheres:

@@ -104,9 +104,7 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
         InvalidInput: a number is NaN or infinite, or a value isn't JSON.
     """
     try:
-        text = json.dumps(
-            {"schema_version": SCHEMA_VERSION, **value}, indent=2, allow_nan=False
-        )
+        text = json.dumps({"schema_version": SCHEMA_VERSION, **value}, indent=2, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise InvalidInput(f"{path}: can't be written as JSON: {error}") from error
     write_text(path, text + "\n")
@@ -123,7 +121,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
-        raise BrokenFile(f"{path}: not readable as JSON ({error}); mend or make it again") from error
+        raise BrokenFile(
+            f"{path}: not readable as JSON ({error}); mend or make it again"
+        ) from error
     except OSError as error:
         raise BrokenFile(f"{path}: {error.strerror}; check the path and its permissions") from error
     if not isinstance(value, dict):
@@ -258,9 +258,7 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
             file[f"body_Ts_world/{name}"] = Ts
         sizes = np.array([len(state) for state in d.states], dtype=np.int64)
         file["states/sizes"] = sizes
-        file.create_dataset(
-            "states/bytes", data=np.frombuffer(b"".join(d.states), dtype=np.uint8)
-        )
+        file.create_dataset("states/bytes", data=np.frombuffer(b"".join(d.states), dtype=np.uint8))
         file.attrs["meta"] = json.dumps(
             {
                 "task": d.task,
@@ -300,7 +298,9 @@ def load_demonstration(path: Path) -> Demonstration:
             **meta,
         )
         if demonstration.content_hash() != expected:
-            raise BrokenFile(f"{path}: content differs from its hash; restore a copy or record again")
+            raise BrokenFile(
+                f"{path}: content differs from its hash; restore a copy or record again"
+            )
     return demonstration
 
 
@@ -344,6 +344,7 @@ def annotation_to_json(annotation: Annotation) -> dict[str, Any]:
         "about": _ANNOTATION_NOTE,
         "demonstration_hash": annotation.demonstration_hash,
         "seconds_spent": annotation.seconds,
+        "settings": dict(annotation.settings),
         "spheres": [
             {
                 "waypoint": sphere.waypoint,
@@ -386,7 +387,10 @@ def annotation_from_json(value: Mapping[str, Any], path: Path) -> Annotation:
                 )
             )
         return Annotation(
-            tuple(spheres), value["demonstration_hash"], float(value.get("seconds_spent", 0.0))
+            tuple(spheres),
+            value["demonstration_hash"],
+            float(value.get("seconds_spent", 0.0)),
+            value.get("settings", {}),
         )
     except SartError as error:
         if isinstance(error, InvalidInput):

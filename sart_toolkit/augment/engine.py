@@ -182,7 +182,13 @@ class _Worker:
     def __call__(self, task: tuple[int, int]) -> tuple[int, int, str]:
         sphere, k = task
         attempt = try_segment(
-            self._backend, self._model, self._demonstration, self._annotation, self._config, sphere, k
+            self._backend,
+            self._model,
+            self._demonstration,
+            self._annotation,
+            self._config,
+            sphere,
+            k,
         )
         if attempt.episode is not None:
             save_episode(self._directory / "episodes" / episode_name(sphere, k), attempt.episode)
@@ -257,19 +263,20 @@ def augment(
         return finished
     outcomes = _read_attempts(out)
     quotas = [
-        len(range(i, config.n - 1, len(annotation.spheres)))
-        for i in range(len(annotation.spheres))
+        len(range(i, config.n - 1, len(annotation.spheres))) for i in range(len(annotation.spheres))
     ]
-    with open(out / "attempts.jsonl", "a") as log:
-        with _runner(make_backend, demonstration, annotation, config, out, workers) as run:
-            while batch := _next_batch(outcomes, quotas):
-                for sphere, k, outcome in run(batch):
-                    outcomes[sphere, k] = outcome
-                    log.write(json.dumps({"sphere": sphere, "k": k, "outcome": outcome}) + "\n")
-                    log.flush()
-                    if progress is not None:
-                        kept = sum(o == KEPT for o in outcomes.values())
-                        progress(kept, config.n - 1, len(outcomes) - kept)
+    with (
+        open(out / "attempts.jsonl", "a") as log,
+        _runner(make_backend, demonstration, annotation, config, out, workers) as run,
+    ):
+        while batch := _next_batch(outcomes, quotas):
+            for sphere, k, outcome in run(batch):
+                outcomes[sphere, k] = outcome
+                log.write(json.dumps({"sphere": sphere, "k": k, "outcome": outcome}) + "\n")
+                log.flush()
+                if progress is not None:
+                    kept = sum(o == KEPT for o in outcomes.values())
+                    progress(kept, config.n - 1, len(outcomes) - kept)
     return _finish(out, outcomes, request, time.perf_counter() - started)
 
 
@@ -285,7 +292,8 @@ def _prepare(
         if read_json(out / "request.json") == json.loads(json.dumps(request)):
             return load_dataset(out) if (out / "dataset.json").exists() else None
         raise OutputExists(
-            f"{out}: holds a dataset made with other settings; add --overwrite or choose another --out"
+            f"{out}: holds a dataset made with other settings; add --overwrite or choose another "
+            "--out"
         )
     check_writable(out, overwrite)
     remove(out)
@@ -321,9 +329,7 @@ def _read_attempts(out: Path) -> dict[tuple[int, int], str]:
     return outcomes
 
 
-def _next_batch(
-    outcomes: dict[tuple[int, int], str], quotas: list[int]
-) -> list[tuple[int, int]]:
+def _next_batch(outcomes: dict[tuple[int, int], str], quotas: list[int]) -> list[tuple[int, int]]:
     """The tries still needed, no more than can all be kept; spheres that give up are left out."""
     batch = []
     for sphere, quota in enumerate(quotas):

@@ -98,8 +98,12 @@ class Backend(abc.ABC):
         """
 
     @abc.abstractmethod
-    def observe(self, cameras: Sequence[str] = ()) -> Observation:
+    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
         """Measure joints, gripper, tool and bodies, with pictures of the named cameras.
+
+        Args:
+            cameras: names of the cameras whose pictures are wanted.
+            image_size: width and height of the pictures, where not the backend's own.
 
         Raises:
             UnknownName: no such camera.
@@ -148,4 +152,3 @@ class Backend(abc.ABC):
 
     def _lacks(self, what: str) -> MissingCapability:
         return MissingCapability(f"backend {self.name!r} can't {what}; use another backend")
-

@@ -141,7 +141,7 @@ class PyBulletBackend(Backend):
         # earlier contacts, so that what follows depends on the state alone.
         self.restore(self.save())
 
-    def observe(self, cameras: Sequence[str] = ()) -> Observation:
+    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
         c = self._client
         known = self.cameras
         for name in cameras:
@@ -160,7 +160,9 @@ class PyBulletBackend(Backend):
             gripper=c.getJointState(self._robot, self._driver)[0] / self.robot.gripper.closed_angle,
             T_world_tool=Ts[self.robot.tool_frame],
             time=self._time,
-            cameras={name: self._picture(name, Ts) for name in cameras},
+            cameras={
+                name: self._picture(name, Ts, image_size or self.image_size) for name in cameras
+            },
             Ts_world_body=Ts_body,
         )
 
@@ -168,11 +170,10 @@ class PyBulletBackend(Backend):
         state = self._client.getLinkState(self._robot, self._links[name], 0, 1)
         return _matrix(state[4], state[5])
 
-    def _picture(self, name: str, Ts_world_frame: dict[str, Array]) -> CameraView:
+    def _picture(self, name: str, Ts_world_frame: dict[str, Array], size: int) -> CameraView:
         camera = self.cameras[name]
         T = np.eye(4) if camera.frame == "world" else Ts_world_frame[camera.frame]
         T_world_camera = T @ camera.T_frame_camera
-        size = self.image_size
         near, far = camera.near, camera.far
         view = inverse(T_world_camera @ _FLIP)
         _, _, rgb, buffer, _ = self._client.getCameraImage(
@@ -198,7 +199,9 @@ class PyBulletBackend(Backend):
 
     def _check_q(self, q: Array) -> Array:
         q = check_array("q", q, (len(self._arm),))
-        over = (q < self._model.lower - _JOINT_TOLERANCE) | (q > self._model.upper + _JOINT_TOLERANCE)
+        over = (q < self._model.lower - _JOINT_TOLERANCE) | (
+            q > self._model.upper + _JOINT_TOLERANCE
+        )
         if over.any():
             j = int(np.argmax(over))
             raise InvalidInput(
@@ -276,8 +279,8 @@ class PyBulletBackend(Backend):
             raise BrokenFile(f"saved state: {error}; record the demonstration again") from error
         if head["robot"] != self.robot.name or head["bodies"] != sorted(self._bodies):
             raise BrokenFile(
-                f"saved state is of robot {head['robot']!r} with {head['bodies']}, this backend has "
-                f"{self.robot.name!r} with {sorted(self._bodies)}; load the matching task"
+                f"saved state is of robot {head['robot']!r} with {head['bodies']}, this backend "
+                f"has {self.robot.name!r} with {sorted(self._bodies)}; load the matching task"
             )
         handle, path = tempfile.mkstemp(suffix=".bullet")
         try:
@@ -305,9 +308,7 @@ def _make_body(client: Any, body: Body) -> int:
     collisions = [shape for shape in body.shapes if shape.collides]
     visual = client.createVisualShapeArray(**visuals)
     collision = (
-        client.createCollisionShapeArray(**_arrays(collisions, drawn=False))
-        if collisions
-        else -1
+        client.createCollisionShapeArray(**_arrays(collisions, drawn=False)) if collisions else -1
     )
     T = body.T_world_body
     index = client.createMultiBody(

@@ -1,1 +1,1 @@
-"""How the tool moves: straight lines in time (`StraightLine`) and following them (`ToolController`)."""
+"""How the tool moves: straight lines in time, and the `ToolController` that follows them."""

@@ -1,4 +1,4 @@
-"""From desired tool poses to joint targets, the same way for teleoperation, augmentation and policies."""
+"""From desired tool poses to joint targets, the same way for whatever moves the robot."""
 
 from __future__ import annotations
 

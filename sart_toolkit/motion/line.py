@@ -93,8 +93,8 @@ def straight_line(
     timing = _timed(limits)
     if timing.duration > duration + 1e-6:
         raise MotionRejected(
-            f"the line needs {timing.duration:.2f} s within the joints' limits, {duration:.2f} s were "
-            "given; allow more time or sample nearer"
+            f"the line needs {timing.duration:.2f} s within the joints' limits, {duration:.2f} s "
+            "were given; allow more time or sample nearer"
         )
     return StraightLine(start, end, duration, knots, timing)
 
@@ -116,7 +116,9 @@ def _path_limits(
     v = min(v, float((spec.velocity_limits / (d1 + tiny)).min()))
     a = min(a, float(((spec.acceleration_limits - d2 * v**2) / (d1 + tiny)).min()))
     if a <= 0:
-        raise MotionRejected("the line bends too sharply in joint space at its speed; allow more time")
+        raise MotionRejected(
+            "the line bends too sharply in joint space at its speed; allow more time"
+        )
     j = min(j, float(((spec.jerk_limits - 3 * d2 * v * a - d3 * v**3) / (d1 + tiny)).min()))
     if j <= 0:
         raise MotionRejected("the line needs more jerk than the joints have; allow more time")

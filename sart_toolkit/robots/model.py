@@ -137,15 +137,15 @@ class RobotModel:
         else:
             p = ", ".join(f"{x:.3f}" for x in T_world_tool[:3, 3])
             raise Unreachable(
-                f"tool pose at ({p}) m is out of reach: {np.linalg.norm(error[:3]) * 1e3:.1f} mm and "
-                f"{np.rad2deg(np.linalg.norm(error[3:])):.1f} deg remain within joint limits; "
+                f"tool pose at ({p}) m is out of reach: {np.linalg.norm(error[:3]) * 1e3:.1f} mm "
+                f"and {np.rad2deg(np.linalg.norm(error[3:])):.1f} deg remain within joint limits; "
                 "choose a pose nearer to the robot or another start"
             )
         step = float(np.abs(q - start).max())
         if max_step is not None and step > max_step:
             raise MotionRejected(
-                f"joint step of {step:.2f} rad exceeds {max_step:.2f} rad: the pose lies on another "
-                "branch or too far; move in smaller steps"
+                f"joint step of {step:.2f} rad exceeds {max_step:.2f} rad: the pose lies on "
+                "another branch or too far; move in smaller steps"
             )
         return q
 

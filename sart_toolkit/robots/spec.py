@@ -91,13 +91,13 @@ class CameraSpec:
         object.__setattr__(self, "T_frame_camera", frozen(T))
 
     def intrinsics(self, width: int, height: int) -> Array:
-        """The pinhole matrix `(3, 3)` [pixels] of a picture; the centre of pixel (0, 0) is (0, 0)."""
+        """The pinhole matrix `(3, 3)` [pixels]; (0, 0) is the centre of the first pixel."""
         f = 0.5 * height / np.tan(0.5 * np.deg2rad(self.fov_y_deg))
         return np.array([[f, 0, 0.5 * (width - 1)], [0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
 
 
 def look_at(p_camera: Array, p_target: Array, up: Array) -> Array:
-    """The camera pose `(4, 4)` at `p_camera` with its z axis through `p_target` and `up` upwards."""
+    """The camera pose `(4, 4)` at `p_camera`, z axis through `p_target`, `up` upwards."""
     z = np.asarray(p_target, float) - p_camera
     z /= np.linalg.norm(z)
     x = np.cross(z, up)

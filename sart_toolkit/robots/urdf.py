@@ -27,8 +27,8 @@ from sart_toolkit.poses import Array
 from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape, resource_path
 
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 4
-_VISUAL_FACES = 500
+_RECIPE = 7
+_ARM_FACES, _GRIPPER_FACES = 150, 300
 _GRIPPER_PREFIX = "gripper_"
 
 
@@ -52,7 +52,7 @@ def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
         json.dumps(
             {
                 "recipe": _RECIPE,
-                "faces": _VISUAL_FACES,
+                "faces": (_ARM_FACES, _GRIPPER_FACES),
                 "sources": [(str(p), p.stat().st_size, p.stat().st_mtime) for p in sources],
                 "spec": _plain(spec),
                 "attachments": _plain(attachments),
@@ -138,11 +138,14 @@ def _elements(source: Path, prefix: str) -> list[ET.Element]:
 
 
 def _lighten(link: ET.Element, base: Path, work: Path, spec: RobotSpec) -> None:
-    """Replace the link's meshes: visuals simplified, collisions by their convex hull."""
+    """Replace the link's meshes: collisions by their convex hull, visuals by a simplified mesh."""
     name = link.get("name", "")
+    colour = spec.link_colours.get(name, (0.6, 0.6, 0.62, 1.0))
+    # The wrist camera sees the gripper close by and the arm never.
+    target = _GRIPPER_FACES if name.startswith(_GRIPPER_PREFIX) else _ARM_FACES
+    solids = _collision_meshes(link, base)
     for kind in ("visual", "collision"):
         for index, element in enumerate(link.findall(kind)):
-            colour = spec.link_colours.get(name, (0.6, 0.6, 0.62, 1.0))
             for material in element.findall("material"):
                 element.remove(material)
             if kind == "visual":
@@ -150,27 +153,63 @@ def _lighten(link: ET.Element, base: Path, work: Path, spec: RobotSpec) -> None:
             mesh = element.find("geometry/mesh")
             if mesh is None:
                 continue
-            source = (base / mesh.get("filename", "")).resolve()
-            if not source.is_file():
-                raise BrokenFile(f"{name}: mesh {source.name} is missing; reinstall its package")
-            loaded = trimesh.load(source, force="mesh", process=True)
-            loaded.merge_vertices(merge_tex=True, merge_norm=True)
-            scale = np.array([float(s) for s in mesh.get("scale", "1 1 1").split()])
-            loaded.apply_scale(scale)
-            light = _simplified(loaded) if kind == "visual" else loaded.convex_hull
+            loaded = _loaded(mesh, base)
+            if kind == "collision":
+                light = loaded.convex_hull
+            else:
+                light = _simplified(loaded, target, solids.get(_where(element)))
             file = f"{name}_{kind}_{index}.obj"
             light.export(work / file, include_normals=False, include_texture=False)
             mesh.set("filename", file)
             mesh.attrib.pop("scale", None)
 
 
-def _simplified(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    if len(mesh.faces) <= _VISUAL_FACES:
+def _where(element: ET.Element) -> str:
+    origin = element.find("origin")
+    return "" if origin is None else f"{origin.get('xyz')} {origin.get('rpy')}"
+
+
+def _collision_meshes(link: ET.Element, base: Path) -> dict[str, trimesh.Trimesh]:
+    """The link's collision meshes by their place, to draw where a visual mesh stays heavy."""
+    return {
+        _where(element): _loaded(mesh, base)
+        for element in link.findall("collision")
+        if (mesh := element.find("geometry/mesh")) is not None
+    }
+
+
+def _loaded(element: ET.Element, base: Path) -> trimesh.Trimesh:
+    source = (base / element.get("filename", "")).resolve()
+    if not source.is_file():
+        raise BrokenFile(f"mesh {source.name} is missing; reinstall the package it comes from")
+    mesh = trimesh.load(source, force="mesh", process=True)
+    assert isinstance(mesh, trimesh.Trimesh)
+    mesh.apply_scale(np.array([float(s) for s in element.get("scale", "1 1 1").split()]))
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    return mesh
+
+
+def _simplified(
+    mesh: trimesh.Trimesh, target: int, solid: trimesh.Trimesh | None
+) -> trimesh.Trimesh:
+    """A mesh of about `target` faces that looks like `mesh`.
+
+    Meshes that fall into many pieces don't simplify well; then the closed `solid` is used, or
+    corners closer than a millimetre are joined first.
+    """
+    joined = mesh.copy()
+    joined.merge_vertices(digits_vertex=3)
+    joined.update_faces(joined.nondegenerate_faces())
+    tries = [_decimated(m, target) for m in (mesh, solid, joined) if m is not None]
+    good = [m for m in tries if len(m.faces) <= 2 * target]
+    return good[0] if good else min(tries, key=lambda m: len(m.faces))
+
+
+def _decimated(mesh: trimesh.Trimesh, target: int) -> trimesh.Trimesh:
+    if len(mesh.faces) <= target:
         return mesh
     vertices, faces = fast_simplification.simplify(
-        np.asarray(mesh.vertices, np.float32),
-        np.asarray(mesh.faces, np.int32),
-        target_count=_VISUAL_FACES,
+        np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), target_count=target
     )
     return trimesh.Trimesh(vertices, faces, process=False)
 

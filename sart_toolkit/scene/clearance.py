@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import coal
@@ -141,7 +141,10 @@ class ClearanceModel:
 def _robot_parts(model: RobotModel) -> list[_Part]:
     pinocchio_model = model.pinocchio_model
     loaded = pin.buildGeomFromUrdf(
-        pinocchio_model, str(model.urdf), pin.GeometryType.COLLISION, package_dirs=str(model.urdf.parent)
+        pinocchio_model,
+        str(model.urdf),
+        pin.GeometryType.COLLISION,
+        package_dirs=str(model.urdf.parent),
     )
     parts = []
     for item in loaded.geometryObjects:
@@ -161,15 +164,15 @@ def _points(geometry: coal.CollisionGeometry) -> Array:
     if isinstance(geometry, coal.ConvexBase):
         return np.array(geometry.points()).reshape(-1, 3)
     if isinstance(geometry, coal.Box):
-        size: Sequence[float] = 2 * np.array(geometry.halfSide)
-        return Shape("box", tuple(size)).corners()
+        x, y, z = 2 * np.array(geometry.halfSide)
+        return Shape("box", (x, y, z)).corners()
     if isinstance(geometry, coal.Sphere):
         return Shape("sphere", (geometry.radius,)).corners()
     if isinstance(geometry, coal.Cylinder):
         return Shape("cylinder", (geometry.radius, 2 * geometry.halfLength)).corners()
     raise InvalidInput(
-        f"collision geometry {type(geometry).__name__} is not convex; use meshes, boxes, spheres or "
-        "cylinders in the URDF"
+        f"collision geometry {type(geometry).__name__} is not convex; use meshes, boxes, spheres "
+        "or cylinders in the URDF"
     )
 
 

@@ -36,7 +36,7 @@ class Body:
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """Bodies in the world, bodies fixed to the robot (`held`), and fixed cameras beside the robot's own.
+    """Bodies in the world, bodies fixed to the robot (`held`), cameras beside the robot's own.
 
     World frame: the robot's base frame, z up; `gravity (3,)` [m/s²].
     """
@@ -71,7 +71,7 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class SceneState:
-    """Where everything is at rest: joints `q (n,)` [rad], gripper in [0, 1], body poses `(4, 4)`."""
+    """Where all is at rest: joints `q (n,)` [rad], gripper in [0, 1], body poses `(4, 4)`."""
 
     q: Array
     gripper: float

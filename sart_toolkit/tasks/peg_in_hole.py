@@ -32,7 +32,12 @@ def _block() -> Body:
     long, short = (wall, _BLOCK_WIDTH, HOLE_DEPTH), (HOLE_WIDTH, wall, HOLE_DEPTH)
     walls = [
         Shape("box", size, pose([x, y, z]), _WOOD)
-        for size, x, y in ((long, middle, 0), (long, -middle, 0), (short, 0, middle), (short, 0, -middle))
+        for size, x, y in (
+            (long, middle, 0),
+            (long, -middle, 0),
+            (short, 0, middle),
+            (short, 0, -middle),
+        )
     ]
     # The floor of the hole is only drawn darker; the table carries the peg.
     floor = Shape(
@@ -61,7 +66,7 @@ class PegInHole(Task):
         bodies=(
             Body(
                 "table",
-                (Shape("box", (4.0, 4.0, 0.1), pose([0.5, 0, -0.05]), _TABLE),),
+                (Shape("box", (2.4, 2.4, 0.1), pose([0.5, 0, -0.05]), _TABLE),),
             ),
             _block(),
         ),
@@ -78,7 +83,11 @@ class PegInHole(Task):
             CameraSpec(
                 "overview",
                 "world",
-                look_at(np.array([1.15, -0.62, 0.52]), np.array([0.42, 0.02, 0.14]), np.array([0, 0, 1.0])),
+                look_at(
+                    np.array([1.15, -0.62, 0.52]),
+                    np.array([0.42, 0.02, 0.14]),
+                    np.array([0, 0, 1.0]),
+                ),
                 fov_y_deg=42.0,
                 near=0.05,
                 far=6.0,
@@ -119,7 +128,8 @@ class PegInHole(Task):
             return f"peg tilted {np.rad2deg(tilt):.0f} deg"
         beside = float(np.abs(tip[:2]).max())
         if beside >= 0.012:
-            return f"peg {beside * 1e3:.0f} mm beside the hole's axis, tip {tip[2] * 1e3:+.0f} mm of rim"
+            above = f"tip {tip[2] * 1e3:+.0f} mm from the rim"
+            return f"peg {beside * 1e3:.0f} mm beside the hole's axis, {above}"
         return f"peg over the hole but only {-tip[2] * 1e3:.0f} mm deep"
 
     def plan(self, state: SceneState) -> list[Stage]:
@@ -132,4 +142,3 @@ class PegInHole(Task):
             T_leg[:3, 3] = hole[:3, 3] + [0, 0, HOLE_DEPTH + tip_height + _PEG_TIP_BELOW_TOOL]
             legs.append(Stage(T_leg, _GRIPPER, speed, tolerance))
         return legs
-

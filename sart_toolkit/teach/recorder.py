@@ -30,7 +30,7 @@ class StepRecorder:
         self._force: list[float] = []
 
     def add(self, controller: ToolController, gripper: float, force: float) -> Observation:
-        """Measure now and keep it, with the command in force and the contact force until now [N]."""
+        """Measure and keep it, with the command in force and the contact force until now [N]."""
         observation = self._backend.observe(self._cameras)
         self.observations.append(observation)
         self._commanded_q.append(controller.commanded_q)

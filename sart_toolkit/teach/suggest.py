@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -55,7 +56,7 @@ class SuggestConfig:
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A suggested radius [m] (0 where there is no room), the clearance behind it, what limits it."""
+    """A suggested radius [m] (0: no room), the clearance behind it, and what limits it."""
 
     radius: float
     clearance: float
@@ -223,7 +224,8 @@ def suggest_annotation(
             if sphere is None:
                 raise InvalidInput(
                     f"waypoint {t}: no room for a sphere of {config.min_radius * 1e3:.1f} mm "
-                    f"({found.limited_by}, clearance {found.clearance * 1e3:.1f} mm); choose another"
+                    f"({found.limited_by}, clearance {found.clearance * 1e3:.1f} mm); choose "
+                    "another"
                 )
             spheres.append(sphere)
     else:
@@ -243,4 +245,6 @@ def suggest_annotation(
             f"no waypoint has room for a sphere of {config.min_radius * 1e3:.1f} mm; start the "
             "demonstration farther from the scene, or lower min_radius"
         )
-    return Annotation(tuple(spheres), demonstration.content_hash())
+    return Annotation(
+        tuple(spheres), demonstration.content_hash(), settings=dataclasses.asdict(config)
+    )

@@ -1,0 +1,53 @@
+# `make` alone lists what there is.
+
+PYTHON ?= $(or $(shell command -v python3.11),python3)
+PYTEST_ARGS ?= -n 2 --dist loadfile
+DEMO_OUT ?= runs/demo
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help setup setup-all demo test lint clean
+.DELETE_ON_ERROR:
+
+help: ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: $(VENV)/.setup ## install the toolkit and what its tests need into .venv
+
+setup-all: $(VENV)/.setup-all ## add SAPIEN, the annotation window and planning, with their Debian libraries
+
+demo: setup ## learn peg-in-hole from one demonstration and write a report
+	$(BIN)/sart run peg_in_hole --out $(DEMO_OUT) --overwrite
+	@echo "The report: $(DEMO_OUT)/report.html"
+
+# One thread a test process: two processes already fill two cores, and torch's threads would
+# wait for each other.
+test: setup ## run the tests (PYTEST_ARGS="-k name" for some of them)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: setup ## check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean: ## remove .venv, caches and build products, but not runs/
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/.setup: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || bash tools/setup_debian.sh core
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
+	    echo "sart_toolkit needs Python 3.11, but '$(PYTHON) --version' says:" \
+	        "$$($(PYTHON) --version 2>&1). Type: make $(MAKECMDGOALS)" \
+	        "PYTHON=/path/to/python3.11" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(PIP_INSTALL) -e '.[dev]'
+	@touch $@
+
+$(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh
+	bash tools/setup_debian.sh sapien annotate
+	$(PIP_INSTALL) -e '.[dev,sapien,annotate,planning]'
+	@touch $@

@@ -1,0 +1,221 @@
+"""What each verb of `sart` takes, as frozen dataclasses that become its flags."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+_JSON = Annotated[bool, arg(name="json", help="Print the result as one JSON object on stdout.")]
+_OVERWRITE = Annotated[bool, arg(help="Replace what is at the output path.")]
+_TASK = Annotated[
+    Positional[str], arg(metavar="TASK", help="Name of the task, such as peg_in_hole.")
+]
+_BACKEND = Annotated[str, arg(help="Simulator or robot to run on.")]
+_ROBOT = Annotated[str | None, arg(help="Robot; the task's own if left out.")]
+_WORKERS = Annotated[int, arg(help="Processes to use.")]
+_SEED = Annotated[int, arg(help="Seed of everything random in this step.")]
+_IMAGE = Annotated[int, arg(help="Width and height of recorded pictures [pixels].")]
+_DEVICE = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Where the policy runs.")]
+_POLICY = Annotated[str, arg(help="Policy: compact_mlp, or resnet18_mlp as in the paper.")]
+_N = Annotated[int, arg(help="Trajectories in all, the demonstration among them.")]
+_EPISODES = Annotated[int, arg(help="Rollouts with random placements.")]
+_EVAL_SEED = Annotated[int, arg(help="Seed of the placements, apart from training's.")]
+_LAW = Annotated[
+    Literal["paper", "area"],
+    arg(help="How positions are drawn on a sphere: as the paper says, or uniform over its area."),
+]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Everything: record, suggest, augment, train, evaluate, report.
+
+    Example: sart run peg_in_hole --out runs/peg
+
+    Example: sart run peg_in_hole --out runs/peg --n 40 --episodes 100 --workers 2
+
+    An interrupted run goes on where it was when the same command is typed again.
+    """
+
+    task: _TASK
+    out: Annotated[Path, arg(help="Directory to write.")]
+    backend: _BACKEND = "pybullet"
+    robot: _ROBOT = None
+    policy: _POLICY = "compact_mlp"
+    n: _N = 40
+    episodes: _EPISODES = 50
+    seed: _SEED = 0
+    eval_seed: _EVAL_SEED = 1000
+    image_size: _IMAGE = 128
+    law: _LAW = "paper"
+    epochs: Annotated[int | None, arg(help="Training epochs; the policy's own if left out.")] = None
+    workers: _WORKERS = 2
+    device: _DEVICE = "auto"
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record one demonstration by the scripted operator.
+
+    Example: sart record peg_in_hole --out demo.h5
+
+    Example: sart record peg_in_hole --out demo.h5 --seed 3 --placement random
+    """
+
+    task: _TASK
+    out: Annotated[Path, arg(help="HDF5 file to write.")]
+    backend: _BACKEND = "pybullet"
+    robot: _ROBOT = None
+    seed: _SEED = 0
+    placement: Annotated[
+        Literal["middle", "random"], arg(help="Where the object stands in its range.")
+    ] = "middle"
+    image_size: _IMAGE = 128
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Suggest:
+    """Suggest precision spheres for a demonstration, as a file that you can edit.
+
+    Example: sart suggest demo.h5 --out annotation.json
+
+    Example: sart suggest demo.h5 --out annotation.json --waypoints 0 18 --margin 0.005
+    """
+
+    demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
+    out: Annotated[Path, arg(help="JSON file to write.")]
+    waypoints: Annotated[
+        tuple[int, ...], arg(help="Key waypoints; chosen to tile the free part if left out.")
+    ] = ()
+    margin: Annotated[float, arg(help="Distance that stays free everywhere [m].")] = 0.002
+    min_radius: Annotated[float, arg(help="Smallest sphere worth having [m].")] = 0.004
+    max_radius: Annotated[float, arg(help="Largest sphere [m].")] = 0.15
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Augment:
+    """Generate collision-free trajectories from a demonstration and its spheres.
+
+    Example: sart augment demo.h5 annotation.json --out dataset
+
+    Example: sart augment demo.h5 annotation.json --out dataset --n 100 --law area --workers 2
+
+    An interrupted generation goes on where it was when the same command is typed again.
+    """
+
+    demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
+    annotation: Annotated[
+        Positional[Path], arg(metavar="ANNOTATION", help="Spheres from `sart suggest`.")
+    ]
+    out: Annotated[Path, arg(help="Directory to write.")]
+    n: _N = 40
+    backend: Annotated[str | None, arg(help="Backend; the demonstration's if left out.")] = None
+    strategy: Annotated[str, arg(help="How segments are chosen.")] = "sart"
+    law: _LAW = "paper"
+    rotation_per_metre: Annotated[
+        float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")
+    ] = 2.0
+    duration: Annotated[float, arg(help="Seconds each segment takes, delta.")] = 2.0
+    seed: _SEED = 0
+    workers: _WORKERS = 1
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a policy on a dataset; interrupted training goes on when typed again.
+
+    Example: sart train dataset --out skill
+
+    Example: sart train dataset --out skill --policy resnet18_mlp --epochs 12 --lr 3e-4
+    """
+
+    dataset: Annotated[
+        Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment`.")
+    ]
+    out: Annotated[Path, arg(help="Skill directory to write.")]
+    policy: _POLICY = "compact_mlp"
+    epochs: Annotated[
+        int | None, arg(help="Passes over the data; the policy's own if left out.")
+    ] = None
+    lr: Annotated[float | None, arg(help="Learning rate; the policy's own if left out.")] = None
+    batch_size: Annotated[int | None, arg(help="The policy's own if left out.")] = None
+    image_size: Annotated[
+        int | None, arg(help="Pictures are scaled to this [pixels]; the policy's own if left out.")
+    ] = None
+    norm: Annotated[
+        Literal["batch", "group"] | None, arg(help="Normalisation layers of resnet18_mlp.")
+    ] = None
+    backbone_weights: Annotated[
+        Path | None, arg(help="File with ResNet18 weights (torchvision's names).")
+    ] = None
+    seed: _SEED = 0
+    device: _DEVICE = "auto"
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Try a skill on random placements.
+
+    Example: sart evaluate skill --out evaluation.json --episodes 100 --workers 2
+    """
+
+    skill: Annotated[Positional[Path], arg(metavar="SKILL", help="Directory from `sart train`.")]
+    out: Annotated[Path, arg(help="JSON file to write; videos go beside it.")]
+    backend: Annotated[str | None, arg(help="Backend; the demonstration's if left out.")] = None
+    episodes: _EPISODES = 50
+    eval_seed: _EVAL_SEED = 1000
+    videos: Annotated[int, arg(help="Videos of the first successes, and as many of failures.")] = 2
+    workers: _WORKERS = 2
+    device: _DEVICE = "cpu"
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what a file or directory of the toolkit holds.
+
+    Example: sart info runs/peg/demo.h5
+    """
+
+    file: Annotated[
+        Positional[Path],
+        arg(metavar="FILE", help="Demonstration, annotation, dataset, skill or run."),
+    ]
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Say what works on this machine and how to mend what doesn't.
+
+    Example: sart doctor
+    """
+
+    json: _JSON = False
+
+
+Verb = (
+    Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Record, tyro.conf.subcommand("record")]
+    | Annotated[Suggest, tyro.conf.subcommand("suggest")]
+    | Annotated[Augment, tyro.conf.subcommand("augment")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+)

@@ -1,0 +1,417 @@
+"""The verbs of `sart`: turn names into objects, call the package, say what came of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sart_toolkit import doctor
+from sart_toolkit.augment.engine import AugmentConfig, augment
+from sart_toolkit.augment.strategies import SamplingConfig
+from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.backends.interface import Backend
+from sart_toolkit.cli.arguments import (
+    Augment,
+    Doctor,
+    Evaluate,
+    Info,
+    Record,
+    Run,
+    Suggest,
+    Train,
+)
+from sart_toolkit.cli.console import progress_bar, say, show
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
+from sart_toolkit.evaluate.report import write_report
+from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate
+from sart_toolkit.learn.skill import load_skill, save_skill
+from sart_toolkit.learn.training import TrainConfig, train
+from sart_toolkit.records import Dataset, Demonstration, library_versions
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.storage import (
+    check_writable,
+    load_annotation,
+    load_dataset,
+    load_demonstration,
+    load_episode,
+    read_json,
+    remove,
+    save_annotation,
+    save_demonstration,
+    write_json,
+)
+from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.teach.scripted import ScriptedOperator
+from sart_toolkit.teach.session import record_demonstration
+from sart_toolkit.teach.suggest import SuggestConfig, suggest_annotation
+
+Result = dict[str, Any]
+
+
+def run_verb(verb: Any) -> None:
+    """Carry out a parsed command and print its result."""
+    show(_VERBS[type(verb)](verb), verb.json)
+
+
+def _backend_factory(
+    name: str, task: Task, robot: str | None, image_size: int
+) -> Callable[[], Backend]:
+    if name not in BACKENDS:
+        raise unknown_name("backend", name, BACKENDS)
+    if image_size < 16:
+        raise InvalidInput(f"image_size: expected at least 16 pixels, got {image_size}")
+    return functools.partial(
+        make_backend, name, get_robot(robot or task.robot), task.scene, image_size
+    )
+
+
+def _model(demonstration: Demonstration, task: Task) -> RobotModel:
+    gripper = float(demonstration.steps.measured_gripper[0])
+    return RobotModel(get_robot(demonstration.robot), task.scene.held, gripper)
+
+
+def _image_size(demonstration: Demonstration) -> int:
+    return next(iter(demonstration.steps.cameras.values())).rgb.shape[1]
+
+
+def record_verb(args: Record) -> Result:
+    """`sart record`."""
+    task = get_task(args.task)
+    robot = get_robot(args.robot or task.robot)
+    make = _backend_factory(args.backend, task, args.robot, args.image_size)
+    check_writable(args.out, args.overwrite)
+    rng = np.random.default_rng(args.seed)
+    placement = Placement() if args.placement == "middle" else task.sample_placement(rng)
+    model = RobotModel(robot, task.scene.held)
+    device = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
+    backend = make()
+    with progress_bar("record", None, "s") as bar:
+        demonstration = record_demonstration(
+            backend, task, model, device, placement, args.seed,
+            progress=lambda seconds: bar.update(seconds - bar.n),
+        )  # fmt: skip
+    backend.close()
+    if not demonstration.success[-1]:
+        raise Mismatch("the demonstration did not reach the goal; record again with another --seed")
+    save_demonstration(args.out, demonstration)
+    return {"demonstration": str(args.out), **_describe_demonstration(demonstration)}
+
+
+def suggest_verb(args: Suggest) -> Result:
+    """`sart suggest`."""
+    demonstration = load_demonstration(args.demo)
+    task = get_task(demonstration.task)
+    config = SuggestConfig(
+        margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius
+    )
+    check_writable(args.out, args.overwrite)
+    with progress_bar("suggest", len(demonstration), "waypoint") as bar:
+        annotation = suggest_annotation(
+            demonstration,
+            _model(demonstration, task),
+            task.scene,
+            args.waypoints or None,
+            config,
+            progress=lambda t: bar.update(t + 1 - bar.n),
+        )
+        bar.update(len(demonstration) - bar.n)
+    save_annotation(args.out, annotation)
+    return {
+        "annotation": str(args.out),
+        "spheres": [
+            {
+                "waypoint": sphere.waypoint,
+                "radius_mm": round(sphere.radius * 1e3, 2),
+                "limited_by": sphere.limited_by,
+            }
+            for sphere in annotation.spheres
+        ],
+    }
+
+
+def augment_verb(args: Augment) -> Result:
+    """`sart augment`."""
+    demonstration = load_demonstration(args.demo)
+    annotation = load_annotation(args.annotation)
+    config = AugmentConfig(
+        n=args.n,
+        strategy=args.strategy,
+        sampling=SamplingConfig(args.law, args.rotation_per_metre),
+        duration=args.duration,
+        seed=args.seed,
+    )
+    task = get_task(demonstration.task)
+    make = _backend_factory(
+        args.backend or demonstration.backend, task, demonstration.robot, _image_size(demonstration)
+    )
+    if args.out.exists() and not args.overwrite and not (args.out / "request.json").exists():
+        check_writable(args.out)
+    with progress_bar("augment", args.n - 1, "trajectory") as bar:
+
+        def progress(kept: int, wanted: int, rejected: int) -> None:
+            bar.set_postfix_str(f"{rejected} rejected", refresh=False)
+            bar.update(kept - bar.n)
+
+        dataset = augment(
+            demonstration,
+            annotation,
+            make,
+            args.out,
+            config,
+            args.workers,
+            args.overwrite,
+            progress,
+        )
+    return {"dataset": str(args.out), **_describe_dataset(dataset)}
+
+
+def train_verb(args: Train) -> Result:
+    """`sart train`."""
+    given = {
+        "epochs": args.epochs,
+        "lr": args.lr,
+        "batch_size": args.batch_size,
+        "image_size": args.image_size,
+        "norm": args.norm,
+        "backbone_weights": args.backbone_weights and str(args.backbone_weights),
+    }
+    overrides = {name: value for name, value in given.items() if value is not None}
+    config = TrainConfig.for_policy(args.policy, **overrides, seed=args.seed, device=args.device)
+    dataset = load_dataset(args.dataset)
+    check_writable(args.out / "config.json", args.overwrite)
+    if args.overwrite:
+        remove(args.out)
+    with progress_bar("train", None, "step") as bar:
+
+        def progress(done: int, total: int, text: str) -> None:
+            bar.total = total
+            bar.set_postfix_str(text, refresh=False)
+            bar.update(done - bar.n)
+
+        result = train(dataset, config, args.out, progress)
+    save_skill(args.out, result, dataset)
+    return {"skill": str(args.out), **_describe_skill(args.out)}
+
+
+def evaluate_verb(args: Evaluate) -> Result:
+    """`sart evaluate`."""
+    skill = load_skill(args.skill)
+    task = get_task(skill.config.task)
+    config = EvaluateConfig(args.episodes, args.eval_seed, args.videos)
+    make = _backend_factory(
+        args.backend or skill.config.backend,
+        task,
+        skill.config.robot,
+        skill.config.recorded_size[0],
+    )
+    check_writable(args.out, args.overwrite)
+    with progress_bar("evaluate", args.episodes, "rollout") as bar:
+
+        def progress(done: int, wanted: int, successes: int) -> None:
+            bar.set_postfix_str(f"{successes}/{done} succeeded", refresh=False)
+            bar.update(done - bar.n)
+
+        result = evaluate(
+            args.skill, task, make, config, args.out, args.workers, args.device, progress
+        )
+    short = {k: v for k, v in result.items() if k not in ("episodes", "versions", "config")}
+    return {"evaluation": str(args.out), **short}
+
+
+def run_whole(args: Run) -> Result:
+    """`sart run`: each step unless its result is there already, then the report."""
+    get_task(args.task)
+    out = args.out
+    wanted = {
+        k: v for k, v in _plain(args).items() if k not in ("out", "overwrite", "json", "workers")
+    }
+    state_file = out / "run.json"
+    state: Result = {"config": wanted, "stages": {}}
+    if args.overwrite:
+        check_writable(out, True)
+        if out.exists() and not state_file.exists() and any(out.iterdir()):
+            raise InvalidInput(
+                f"{out}: is not a run's directory, so it won't be replaced; choose another --out"
+            )
+        remove(out)
+    elif state_file.exists():
+        state = read_json(state_file)
+        if state["config"] != wanted:
+            changed = [k for k, v in wanted.items() if state["config"].get(k) != v]
+            raise Mismatch(
+                f"{out}: holds a run with another {', '.join(changed)}; add --overwrite or choose "
+                "another --out"
+            )
+    else:
+        check_writable(out)
+    state |= {
+        "command": shlex.join(["sart", *sys.argv[1:]]),
+        "versions": library_versions(),
+        "machine": doctor.machine(),
+    }
+    write_json(state_file, state)
+    demo, annotation, dataset = out / "demo.h5", out / "annotation.json", out / "dataset"
+    skill, evaluation = out / "skill", out / "evaluation.json"
+    steps: list[tuple[str, Path, Callable[[], Result]]] = [
+        ("record", demo, lambda: record_verb(Record(
+            args.task, demo, args.backend, args.robot, args.seed, image_size=args.image_size
+        ))),
+        ("suggest", annotation, lambda: suggest_verb(Suggest(demo, annotation))),
+        ("augment", dataset / "dataset.json", lambda: augment_verb(Augment(
+            demo, annotation, dataset, args.n, law=args.law, seed=args.seed, workers=args.workers,
+        ))),
+        ("train", skill / "config.json", lambda: train_verb(Train(
+            dataset, skill, args.policy, args.epochs, seed=args.seed, device=args.device
+        ))),
+        ("evaluate", evaluation, lambda: evaluate_verb(Evaluate(
+            skill, evaluation, episodes=args.episodes, eval_seed=args.eval_seed,
+            workers=args.workers,
+        ))),
+    ]  # fmt: skip
+    for name, result, carry_out in steps:
+        if result.exists():
+            say(f"{name:<9} done before: {result}")
+            continue
+        started = time.perf_counter()
+        carry_out()
+        seconds = time.perf_counter() - started
+        before = state["stages"].get(name, 0.0)
+        state["stages"][name] = before + seconds
+        write_json(state_file, state)
+    report = out / "report.html"
+    write_report(out, report)
+    figures = read_json(evaluation)
+    generated = read_json(dataset / "dataset.json")
+    return {
+        "task": args.task,
+        "success": f"{figures['n_success']}/{figures['n_episodes']}",
+        "success_rate": figures["success_rate"],
+        "ci95": figures["ci95"],
+        "kept": generated["n_kept"],
+        "attempted": generated["n_attempted"],
+        "stages_seconds": {k: round(v, 1) for k, v in state["stages"].items()},
+        "seconds": round(sum(state["stages"].values()), 1),
+        "skill": str(skill),
+        "report": str(report),
+    }
+
+
+def info_verb(args: Info) -> Result:
+    """`sart info`: by what the file or directory holds."""
+    path = args.file
+    if not path.exists():
+        raise MissingFile(f"{path}: no such file or directory; check the path")
+    if path.is_dir():
+        if (path / "run.json").exists():
+            state = read_json(path / "run.json")
+            return {"kind": "run", **state["config"], "stages": state["stages"]}
+        if (path / "model.safetensors").exists():
+            return {"kind": "skill", **_describe_skill(path)}
+        if (path / "request.json").exists():
+            return {"kind": "dataset", **_describe_dataset(load_dataset(path))}
+        raise BrokenFile(f"{path}: holds no run, skill or dataset; pass another directory")
+    if path.suffix == ".json":
+        value = read_json(path)
+        if "spheres" in value:
+            spheres = load_annotation(path).spheres
+            return {
+                "kind": "annotation",
+                "demonstration": value["demonstration_hash"],
+                "spheres": [
+                    f"waypoint {s.waypoint}: {s.radius * 1e3:.1f} mm ({s.source})" for s in spheres
+                ],
+            }
+        if "success_rate" in value:
+            rows = ("episodes", "versions", "config", "seeds", "videos")
+            return {"kind": "evaluation", **{k: v for k, v in value.items() if k not in rows}}
+        raise BrokenFile(f"{path}: neither an annotation nor an evaluation; pass another file")
+    try:
+        return {"kind": "demonstration", **_describe_demonstration(load_demonstration(path))}
+    except BrokenFile as error:
+        if "holds 'episode'" not in str(error):
+            raise
+    episode = load_episode(path)
+    return {"kind": "episode", "steps": len(episode), **_plain(episode.provenance)}
+
+
+def doctor_verb(args: Doctor) -> Result:
+    """`sart doctor`: findings to read, or as data."""
+    findings = doctor.diagnose()
+    if args.json:
+        return {"findings": [dataclasses.asdict(finding) for finding in findings]}
+    lines: Result = {}
+    for finding in findings:
+        mark = "ok  " if finding.ok else ("FAIL" if finding.required else "off ")
+        remedy = f"\n      -> {finding.remedy}" if finding.remedy and not finding.ok else ""
+        lines[f"{mark} {finding.name}"] = f"{finding.detail}{remedy}"
+    return lines
+
+
+def _describe_demonstration(demonstration: Demonstration) -> Result:
+    d = demonstration
+    return {
+        "task": d.task,
+        "robot": d.robot,
+        "backend": d.backend,
+        "waypoints": len(d),
+        "seconds": float(d.timestamps[-1]),
+        "success": bool(d.success[-1]),
+        "placement": dict(d.task_parameters.get("placement", {})),
+        "cameras": {k: "x".join(map(str, c.rgb.shape[1:3])) for k, c in d.steps.cameras.items()},
+        "operator": d.operator,
+        "content_hash": d.content_hash(),
+    }
+
+
+def _describe_dataset(dataset: Dataset) -> Result:
+    keys = ("n_trajectories", "n_kept", "n_attempted", "rejections", "seconds", "content_hash")
+    return {"task": dataset.demonstration.task} | {k: dataset.info[k] for k in keys}
+
+
+def _describe_skill(path: Path) -> Result:
+    skill = load_skill(path)
+    training = skill.training
+    return {
+        "task": skill.config.task,
+        "robot": skill.config.robot,
+        "policy": skill.config.training.policy,
+        "epochs": skill.config.training.epochs,
+        "image_size": skill.config.training.image_size,
+        "trajectories": training["trajectories"],
+        "final_loss": training["final_loss"],
+        "seconds": training["seconds"],
+        "images_per_second": training["images_per_second"],
+    }
+
+
+def _plain(record: Any) -> Result:
+    """A dataclass as JSON values."""
+
+    def simple(value: Any) -> Any:
+        return value.tolist() if isinstance(value, np.ndarray) else str(value)
+
+    plain: Result = json.loads(json.dumps(dataclasses.asdict(record), default=simple))
+    return plain
+
+
+_VERBS: dict[type, Callable[[Any], Result]] = {
+    Run: run_whole,
+    Record: record_verb,
+    Suggest: suggest_verb,
+    Augment: augment_verb,
+    Train: train_verb,
+    Evaluate: evaluate_verb,
+    Info: info_verb,
+    Doctor: doctor_verb,
+}

@@ -1,0 +1,269 @@
+"""Benchmarks of the toolkit: `python tools/bench.py NAME` prints one JSON object as its last line.
+
+Progress goes to stderr. A benchmark is a function from its own command-line arguments to figures,
+and one line in `BENCHMARKS`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import os
+import platform
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sart_toolkit.errors import SartError, unknown_name
+from sart_toolkit.learn.policies import POLICIES
+from sart_toolkit.learn.training import (
+    TrainConfig,
+    build_policy,
+    make_optimizer,
+    resolve_bfloat16,
+    resolve_device,
+    train,
+)
+from sart_toolkit.learn.windows import Batch, build_windows
+from sart_toolkit.poses import check_positive, pose
+from sart_toolkit.records import (
+    Annotation,
+    CameraRecord,
+    Dataset,
+    Demonstration,
+    Episode,
+    PrecisionSphere,
+    Provenance,
+    Steps,
+)
+
+_VERSIONS_OF = ("sart_toolkit", "torch", "numpy", "pybullet", "h5py", "pin", "coal", "ruckig")
+_DEMONSTRATION_STEPS = 60
+_SEGMENT_STEPS = 20
+
+
+# --- the training loop --------------------------------------------------------------------------
+
+
+def bench_train(arguments: Sequence[str]) -> dict[str, Any]:
+    """Images/s of the training loop, of the same model's bare steps, and their ratio, by policy.
+
+    Both run in turns in this process: an epoch or two through `learn.training.train` (windows drawn
+    and shifted, losses kept, checkpoints), then as many forward-backward-step rounds on one batch
+    that is loaded already. The ratio is the median over the turns.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py train", description=bench_train.__doc__)
+    parser.add_argument("--policy", default="all", help=f"all, {', '.join(POLICIES)}")
+    parser.add_argument("--repeats", type=int, default=7, help="turns of each loop")
+    parser.add_argument("--seconds", type=float, default=2.0, help="about, for one turn")
+    parser.add_argument("--image-size", type=int, help="[pixels]; the policy's own if left out")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
+    parser.add_argument("--threads", type=int, help="torch's threads; its own choice if left out")
+    options = parser.parse_args(arguments)
+    check_positive("--repeats", options.repeats)
+    check_positive("--seconds", options.seconds)
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    overrides: dict[str, Any] = {"device": options.device, "epochs": 1}
+    if options.image_size is not None:
+        overrides["image_size"] = options.image_size
+    policies = list(POLICIES) if options.policy == "all" else [options.policy]
+    return {
+        policy: _train_figures(
+            TrainConfig.for_policy(policy, **overrides), options.repeats, options.seconds
+        )
+        for policy in policies
+    }
+
+
+def _train_figures(config: TrainConfig, repeats: int, seconds: float) -> dict[str, Any]:
+    windows = build_windows(_synthetic_dataset(1), config.camera, config.image_size, config.history)
+    first = torch.arange(config.batch_size) % len(windows.history)
+    batch = windows.to(resolve_device(config.device)).batch(first)
+    # The first steps choose and compile kernels.
+    n_steps = max(4, round(seconds / _bare_seconds(config, batch, 3)))
+    n_steps = max(4, round(seconds * n_steps / _bare_seconds(config, batch, n_steps) / n_steps))
+    per_trajectory = _DEMONSTRATION_STEPS // 2 + _SEGMENT_STEPS
+    n_windows = n_steps * config.batch_size - _DEMONSTRATION_STEPS
+    dataset = _synthetic_dataset(max(1, round(n_windows / per_trajectory)))
+    loop, bare = [], []
+    with tempfile.TemporaryDirectory() as scratch:
+        for turn in range(repeats + 1):
+            result = train(dataset, config, Path(scratch), resume=False)
+            rounds = -(-result.n_windows // config.batch_size)
+            n_images = rounds * config.batch_size * config.history
+            bare_rate = n_images / (_bare_seconds(config, batch, rounds) / 1.0)
+            _say(
+                f"{config.policy} turn {turn}/{repeats}: loop {result.images_per_second:.0f}, "
+                f"bare {bare_rate:.0f} images/s{' (warming up)' if turn == 0 else ''}"
+            )
+            if turn > 0:
+                loop.append(result.images_per_second)
+                bare.append(bare_rate)
+    return {
+        "loop_images_per_second": statistics.median(loop),
+        "bare_images_per_second": statistics.median(bare),
+        "loop_over_bare": statistics.median(a / b for a, b in zip(loop, bare, strict=True)),
+        "loop_over_bare_range": sorted(a / b for a, b in zip(loop, bare, strict=True))[:: repeats - 1 or 1],
+        "repeats": repeats,
+        "steps_per_repeat": rounds,
+        "batch_size": config.batch_size,
+        "history": config.history,
+        "image_size": config.image_size,
+        "device": result.device,
+        "bfloat16": result.bfloat16,
+        "threads": torch.get_num_threads(),
+    }
+
+
+def _bare_seconds(config: TrainConfig, batch: Batch, n_steps: int) -> float:
+    """Seconds of forward-backward-step rounds on one batch, nothing else."""
+    device = resolve_device(config.device)
+    bfloat16 = resolve_bfloat16(config.bfloat16, device)
+    policy = build_policy(config).to(device).train()
+    optimizer = make_optimizer(policy, config)
+    frames, gripper, actions = batch
+    began = time.perf_counter()
+    for _ in range(n_steps):
+        with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16):
+            loss = policy.loss(frames, gripper, actions)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+    loss.item()
+    return time.perf_counter() - began
+
+
+def _synthetic_dataset(n_episodes: int) -> Dataset:
+    """A dataset of random 128x128 pictures, shaped as augmentation makes them."""
+    rng = np.random.default_rng(0)
+
+    def steps(n: int) -> Steps:
+        commanded = np.tile(pose((0.4, 0.0, 0.3)), (n, 1, 1))
+        commanded[:, :3, 3] += np.cumsum(rng.normal(0, 0.005, (n, 3)), 0)
+        camera = CameraRecord(
+            rgb=rng.integers(0, 256, (n, 128, 128, 3), dtype=np.uint8),
+            depth=np.zeros((n, 128, 128), np.float32),
+            intrinsics=np.diag([128.0, 128.0, 1.0]),
+            T_tool_camera=np.eye(4),
+        )
+        joints = np.zeros((n, 6))
+        gripper = rng.uniform(0, 1, n)
+        return Steps(
+            joint_positions=joints,
+            joint_velocities=joints,
+            commanded_joint_positions=joints,
+            measured_Ts_world_tool=commanded,
+            commanded_Ts_world_tool=commanded,
+            measured_gripper=gripper,
+            commanded_gripper=gripper,
+            contact_force=np.zeros(n),
+            cameras={"wrist": camera},
+        )
+
+    n = _DEMONSTRATION_STEPS
+    demonstration = Demonstration(
+        task="synthetic",
+        task_parameters={},
+        robot="none",
+        backend="none",
+        steps=steps(n),
+        timestamps=np.arange(n) / 10,
+        body_Ts_world={},
+        success=np.ones(n, bool),
+        raw_commands=np.zeros((3 * n, 7)),
+        states=(),
+        operator="none",
+        device="none",
+        seconds=0.0,
+    )
+    sha = demonstration.content_hash()
+    key = demonstration.steps.measured_Ts_world_tool[0]
+    episodes = tuple(
+        Episode(
+            steps(_SEGMENT_STEPS),
+            Provenance(sha, 0, k, n // 2, key, 0, "sart", "paper"),
+        )
+        for k in range(n_episodes)
+    )
+    return Dataset(demonstration, Annotation((PrecisionSphere(0, key, 0.1),), sha), episodes)
+
+
+# --- the table, the machine ---------------------------------------------------------------------
+
+BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
+    "train": bench_train,
+}
+
+
+def machine_info() -> dict[str, Any]:
+    """Processor, usable cores, memory, CUDA device and Python of this machine, without its name."""
+    return {
+        "cpu": _cpu_model(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "load_average": os.getloadavg()[0],
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that benchmarks depend on, of those that are installed."""
+    found = {}
+    for name in _VERSIONS_OF:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The exit code of running one benchmark, whose JSON object is printed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name", help=", ".join(BENCHMARKS))
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="see NAME --help")
+    parsed = parser.parse_args(arguments)
+    try:
+        if parsed.name not in BENCHMARKS:
+            raise unknown_name("benchmark", parsed.name, BENCHMARKS)
+        machine = machine_info()
+        figures = BENCHMARKS[parsed.name](parsed.arguments)
+    except SartError as error:
+        _say(f"error: {error}")
+        return 2
+    report = {
+        "benchmark": parsed.name,
+        "figures": figures,
+        "machine": machine,
+        "versions": versions(),
+    }
+    print(json.dumps(report))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
