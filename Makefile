@@ -20,7 +20,7 @@ setup: $(VENV)/.setup ## install the toolkit and what its tests need into .venv
 setup-all: $(VENV)/.setup-all ## add SAPIEN, the annotation window and planning, with their Debian libraries
 
 demo: setup ## learn peg-in-hole from one demonstration and write a report
-	$(BIN)/sart run peg_in_hole --out $(DEMO_OUT) --overwrite
+	$(BIN)/sart run peg_in_hole --out $(DEMO_OUT)
 	@echo "The report: $(DEMO_OUT)/report.html"
 
 # One thread a test process: two processes already fill two cores, and torch's threads would

@@ -211,7 +211,7 @@ def _work(task: tuple[int, int]) -> tuple[int, int, str]:
     return _worker(task)
 
 
-def augment(
+def augment_demonstration(
     demonstration: Demonstration,
     annotation: Annotation,
     make_backend: BackendFactory,

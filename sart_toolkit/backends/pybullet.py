@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import tempfile
 import zlib
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
-import pybullet as p
-from pybullet_utils.bullet_client import BulletClient
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit.backends.interface import (
@@ -28,6 +27,29 @@ from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec, Shape
 from sart_toolkit.scene.spec import Body, SceneSpec, SceneState
+
+
+@contextmanager
+def _without_greetings() -> Iterator[None]:
+    """Keep off stdout and stderr what PyBullet prints from C on import and connection."""
+    libc = ctypes.CDLL(None)
+    kept = [os.dup(fd) for fd in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for fd in (1, 2):
+            os.dup2(nowhere, fd)
+        yield
+        libc.fflush(None)
+    finally:
+        for fd, copy in zip((1, 2), kept, strict=True):
+            os.dup2(copy, fd)
+            os.close(copy)
+        os.close(nowhere)
+
+
+with _without_greetings():
+    import pybullet as p
+    from pybullet_utils.bullet_client import BulletClient
 
 _STEPS = PHYSICS_HZ // CONTROL_HZ
 _MAGIC = b"sart-pybullet-1\n"
@@ -53,7 +75,8 @@ class PyBulletBackend(Backend):
         """Load robot and scene; call `reset` before anything else."""
         super().__init__(robot, scene, image_size)
         self._model = RobotModel(robot, scene.held)
-        self._client: Any = BulletClient(p.DIRECT)
+        with _without_greetings():
+            self._client: Any = BulletClient(p.DIRECT)
         c = self._client
         c.setTimeStep(1.0 / PHYSICS_HZ)
         c.setGravity(*scene.gravity)

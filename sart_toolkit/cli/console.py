@@ -42,5 +42,6 @@ def _readable(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{k}: {_readable(v)}" for k, v in value.items()) or "none"
     if isinstance(value, list | tuple):
-        return ", ".join(_readable(v) for v in value) or "none"
+        apart = "; " if value and isinstance(value[0], Mapping) else ", "
+        return apart.join(_readable(v) for v in value) or "none"
     return str(value)

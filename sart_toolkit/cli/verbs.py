@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit import doctor
-from sart_toolkit.augment.engine import AugmentConfig, augment
+from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
 from sart_toolkit.augment.strategies import SamplingConfig
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Backend
@@ -32,7 +32,7 @@ from sart_toolkit.cli.arguments import (
 from sart_toolkit.cli.console import progress_bar, say, show
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
 from sart_toolkit.evaluate.report import write_report
-from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate
+from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
 from sart_toolkit.learn.skill import load_skill, save_skill
 from sart_toolkit.learn.training import TrainConfig, train
 from sart_toolkit.records import Dataset, Demonstration, library_versions
@@ -76,11 +76,6 @@ def _backend_factory(
     )
 
 
-def _model(demonstration: Demonstration, task: Task) -> RobotModel:
-    gripper = float(demonstration.steps.measured_gripper[0])
-    return RobotModel(get_robot(demonstration.robot), task.scene.held, gripper)
-
-
 def _image_size(demonstration: Demonstration) -> int:
     return next(iter(demonstration.steps.cameras.values())).rgb.shape[1]
 
@@ -119,7 +114,7 @@ def suggest_verb(args: Suggest) -> Result:
     with progress_bar("suggest", len(demonstration), "waypoint") as bar:
         annotation = suggest_annotation(
             demonstration,
-            _model(demonstration, task),
+            get_robot(demonstration.robot),
             task.scene,
             args.waypoints or None,
             config,
@@ -163,7 +158,7 @@ def augment_verb(args: Augment) -> Result:
             bar.set_postfix_str(f"{rejected} rejected", refresh=False)
             bar.update(kept - bar.n)
 
-        dataset = augment(
+        dataset = augment_demonstration(
             demonstration,
             annotation,
             make,
@@ -222,7 +217,7 @@ def evaluate_verb(args: Evaluate) -> Result:
             bar.set_postfix_str(f"{successes}/{done} succeeded", refresh=False)
             bar.update(done - bar.n)
 
-        result = evaluate(
+        result = evaluate_skill(
             args.skill, task, make, config, args.out, args.workers, args.device, progress
         )
     short = {k: v for k, v in result.items() if k not in ("episodes", "versions", "config")}

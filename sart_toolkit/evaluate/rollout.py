@@ -172,7 +172,7 @@ def _work(episode: int) -> Rollout:
     return _worker(episode)
 
 
-def evaluate(
+def evaluate_skill(
     skill_directory: Path,
     task: Task,
     make_backend: BackendFactory,

@@ -77,7 +77,7 @@ def record_demonstration(
     task: Task,
     model: RobotModel,
     device: Device,
-    placement: Placement,
+    placement: Placement | None = None,
     seed: int | None = None,
     config: SessionConfig | None = None,
     progress: Callable[[float], None] | None = None,
@@ -91,7 +91,7 @@ def record_demonstration(
         task: what is demonstrated.
         model: the robot's kinematics.
         device: what steers.
-        placement: where the object stands.
+        placement: where the object stands; in the middle of its range if left out.
         seed: the device's seed, kept with the demonstration.
         config: cameras and limits.
         progress: called with the seconds recorded so far.
@@ -100,6 +100,7 @@ def record_demonstration(
         InvalidInput: the device did not stop within `max_seconds`.
     """
     config = config or SessionConfig()
+    placement = placement or Placement()
     controller = ToolController(model, ControllerConfig())
     state = task.initial_state(model, placement)
     backend.reset(state)

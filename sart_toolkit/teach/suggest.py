@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from sart_toolkit.records import (
     convergence_waypoint,
 )
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scene.clearance import ClearanceModel
 from sart_toolkit.scene.spec import SceneSpec
 
@@ -174,7 +176,7 @@ def _sphere_points(uv: Array) -> Array:
 
 def suggest_annotation(
     demonstration: Demonstration,
-    model: RobotModel,
+    robot: RobotSpec,
     scene: SceneSpec,
     waypoints: Sequence[int] | None = None,
     config: SuggestConfig | None = None,
@@ -188,7 +190,7 @@ def suggest_annotation(
 
     Args:
         demonstration: what was shown; it must hold the poses of the scene's bodies.
-        model: the robot with its gripper as during the demonstration.
+        robot: the robot that was steered.
         scene: the task's scene.
         waypoints: key waypoints, or `None` to choose them.
         config: margins and limits.
@@ -198,15 +200,19 @@ def suggest_annotation(
         InvalidInput: a waypoint is out of range or has no room, or no waypoint has room.
     """
     config = config or SuggestConfig()
-    clearances = ClearanceModel(model, scene)
+
+    @functools.cache
+    def clearances(gripper: float) -> ClearanceModel:
+        return ClearanceModel(RobotModel(robot, scene.held, gripper), scene)
+
+    steps = demonstration.steps
     last = len(demonstration) - 1
 
     def sphere_at(t: int) -> tuple[Suggestion, PrecisionSphere | None]:
-        T_key = demonstration.steps.measured_Ts_world_tool[t]
+        T_key = steps.measured_Ts_world_tool[t]
         bodies = {name: Ts[t] for name, Ts in demonstration.body_Ts_world.items()}
-        found = suggest_radius(
-            clearances, demonstration.steps.joint_positions[t], T_key, bodies, config
-        )
+        opening = clearances(round(float(steps.measured_gripper[t]), 2))
+        found = suggest_radius(opening, steps.joint_positions[t], T_key, bodies, config)
         if progress is not None:
             progress(t)
         if found.radius < config.min_radius:

@@ -1,0 +1,269 @@
+"""The command line: each verb does its work, and bad input is one line, code 2, nothing replaced."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sart_toolkit.cli import main
+from sart_toolkit.evaluate.report import write_report
+from sart_toolkit.storage import load_demonstration
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: object) -> dict[str, Any]:
+    """The JSON result of a verb that should succeed."""
+    capsys.readouterr()
+    main([*map(str, argv), "--json"])
+    # PyBullet greets on stdout when it is first imported; our result is the last line.
+    result: dict[str, Any] = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    return result
+
+
+def error(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
+    """The one line on stderr of a verb that should fail with code 2."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        main([str(a) for a in argv])
+    assert exit_.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("sart: error: ")
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with what `record`, `suggest` and `augment` leave."""
+    out = tmp_path_factory.mktemp("chain")
+    main(["record", "peg_in_hole", "--out", f"{out}/demo.h5", "--image-size", "32"])
+    main(["suggest", f"{out}/demo.h5", "--out", f"{out}/annotation.json"])
+    main(["augment", f"{out}/demo.h5", f"{out}/annotation.json", "--out", f"{out}/data", "--n", "5"])
+    return out
+
+
+def test_whole_run_leaves_every_result_and_goes_on_where_it_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    argv = ["run", "peg_in_hole", "--out", out, "--n", 5, "--episodes", 2, "--epochs", 1]
+    argv += ["--image-size", 48, "--workers", 1]
+    first = run(capsys, *argv)
+    for name in ("demo.h5", "annotation.json", "dataset", "skill", "evaluation.json"):
+        assert (out / name).exists(), name
+    page = (out / "report.html").read_text()
+    assert "peg_in_hole" in page and "<video" in page
+    evaluation = json.loads((out / "evaluation.json").read_text())
+    needed = {"task", "backend", "n_episodes", "n_success", "success_rate", "ci95", "seeds"}
+    assert needed | {"policy", "seconds"} <= set(evaluation)
+    assert evaluation["n_episodes"] == 2
+    assert first["kept"] == 4
+
+    stamps = {p: p.stat().st_mtime_ns for p in out.rglob("*.h5")}
+    (out / "evaluation.json").unlink()
+    again = run(capsys, *argv)
+    assert again["success"] == first["success"]
+    assert stamps == {p: p.stat().st_mtime_ns for p in out.rglob("*.h5")}
+
+    assert "another n" in error(capsys, *argv[:4], "--n", 6)
+    write_report(out, out / "again.html")
+    assert run(capsys, "info", out)["kind"] == "run"
+
+
+def test_same_seed_gives_the_same_bytes(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = run(capsys, "info", chain / "data")["content_hash"]
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--n", 5]
+    assert run(capsys, *argv, "--out", tmp_path / "two", "--workers", 2)["content_hash"] == before
+    other = run(capsys, *argv, "--out", tmp_path / "other", "--seed", 1)["content_hash"]
+    assert other != before
+
+
+def test_info_tells_each_kind_of_file(chain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kinds = {
+        "demo.h5": "demonstration",
+        "annotation.json": "annotation",
+        "data": "dataset",
+        "data/episodes/sphere00_k00000.h5": "episode",
+    }
+    for name, kind in kinds.items():
+        assert run(capsys, "info", chain / name)["kind"] == kind
+    main(["info", str(chain / "demo.h5")])
+    assert "peg_in_hole" in capsys.readouterr().out
+    assert "no run, skill or dataset" in error(capsys, "info", chain)
+    assert "neither an annotation" in error(capsys, "info", chain / "data" / "dataset.json")
+
+
+def test_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    nowhere = tmp_path / "nowhere.h5"
+    for argv in (
+        ["suggest", nowhere, "--out", tmp_path / "a.json"],
+        ["augment", nowhere, nowhere, "--out", tmp_path / "d"],
+        ["train", nowhere, "--out", tmp_path / "s"],
+        ["evaluate", nowhere, "--out", tmp_path / "e.json"],
+        ["info", nowhere],
+    ):
+        assert "nowhere.h5: no such" in error(capsys, *argv)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_truncated_demonstration_is_refused_and_nothing_replaced(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = (chain / "demo.h5").read_bytes()
+    cut = tmp_path / "cut.h5"
+    cut.write_bytes(whole[: len(whole) // 2])
+    target = tmp_path / "a.json"
+    target.write_text("mine")
+    assert "truncated" in error(capsys, "suggest", cut, "--out", target, "--overwrite")
+    assert target.read_text() == "mine"
+
+
+def test_annotation_of_another_demonstration_is_refused(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.h5"
+    run(capsys, "record", "peg_in_hole", "--out", other, "--seed", 9, "--image-size", 32)
+    said = error(capsys, "augment", other, chain / "annotation.json", "--out", tmp_path / "d")
+    assert "made for another demonstration" in said
+    assert not (tmp_path / "d").exists()
+
+
+@pytest.mark.parametrize("radius", [0.0, -0.01, math.nan, math.inf])
+def test_impossible_radius_is_refused(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], radius: float
+) -> None:
+    value = json.loads((chain / "annotation.json").read_text())
+    value["spheres"][0]["radius_m"] = radius
+    edited = tmp_path / "edited.json"
+    edited.write_text(json.dumps(value))
+    said = error(capsys, "augment", chain / "demo.h5", edited, "--out", tmp_path / "d")
+    assert "radius of the sphere at waypoint 0: expected a finite number > 0" in said
+    assert not (tmp_path / "d").exists()
+
+
+def test_poses_out_of_reach_are_counted_and_end_in_an_error(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    value = json.loads((chain / "annotation.json").read_text())
+    value["spheres"] = [{**value["spheres"][0], "radius_m": 3.0, "source": "human"}]
+    edited = tmp_path / "edited.json"
+    edited.write_text(json.dumps(value))
+    said = error(capsys, "augment", chain / "demo.h5", edited, "--out", tmp_path / "d", "--n", 2)
+    assert "out of reach: 20" in said and "smaller radii" in said
+
+
+def test_unknown_names_offer_the_nearest(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "x"
+    said = error(capsys, "run", "peg_in_hol", "--out", out)
+    assert "unknown task 'peg_in_hol': did you mean 'peg_in_hole'?" in said
+    said = error(capsys, "record", "peg_in_hole", "--out", out, "--backend", "pybulet")
+    assert "did you mean 'pybullet'" in said
+    said = error(capsys, "record", "peg_in_hole", "--out", out, "--robot", "ur5")
+    assert "unknown robot 'ur5': did you mean 'ur5e_2f85'?" in said
+    said = error(capsys, "train", chain / "data", "--out", out, "--policy", "compact")
+    assert "did you mean 'compact_mlp'" in said
+    said = error(
+        capsys, "augment", chain / "demo.h5", chain / "annotation.json", "--out", out,
+        "--strategy", "sert",
+    )  # fmt: skip
+    assert "did you mean 'sart'" in said
+    assert not out.exists()
+
+
+def test_what_is_there_is_not_replaced_without_overwrite(
+    chain: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (chain / "demo.h5").read_bytes()
+    said = error(capsys, "record", "peg_in_hole", "--out", chain / "demo.h5")
+    assert "already exists; add --overwrite" in said
+    assert (chain / "demo.h5").read_bytes() == before
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--out", chain / "data"]
+    assert "made with other settings" in error(capsys, *argv, "--n", 7)
+
+
+def test_no_permission_is_one_line(chain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # Not even root may create files there.
+    said = error(capsys, "suggest", chain / "demo.h5", "--out", "/proc/sart/annotation.json")
+    assert "/proc/sart/annotation.json: " in said
+    # A file where a directory should be.
+    said = error(capsys, "record", "peg_in_hole", "--out", chain / "demo.h5" / "x.h5")
+    assert "choose another --out" in said
+
+
+def test_overwrite_of_a_directory_that_is_no_run_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    said = error(capsys, "run", "peg_in_hole", "--out", tmp_path, "--overwrite")
+    assert "is not a run's directory" in said
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+@pytest.mark.parametrize(
+    ("flag", "value", "message"),
+    [
+        ("--n", "1", "n: expected at least 2"),
+        ("--seed", "-1", "seed: expected a whole number >= 0"),
+        ("--duration", "0", "duration: expected a finite number > 0"),
+        ("--rotation-per-metre", "nan", "rotation_per_metre: expected a finite number >= 0"),
+        ("--workers", "0", "workers: expected at least 1"),
+        ("--duration", "0.2", "none of"),
+    ],
+)
+def test_impossible_options_are_refused(
+    chain: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    flag: str,
+    value: str,
+    message: str,
+) -> None:
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--out", tmp_path / "d"]
+    assert message in error(capsys, *argv, flag, value)
+
+
+def test_interruption_says_how_to_go_on(
+    chain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sart_toolkit.cli.verbs.suggest_annotation", interrupted)
+    with pytest.raises(SystemExit) as exit_:
+        main(["suggest", str(chain / "demo.h5"), "--out", str(tmp_path / "a.json")])
+    assert exit_.value.code == 130
+    assert "type the same command again" in capsys.readouterr().err
+    assert not (tmp_path / "a.json").exists()
+
+
+def test_a_demonstration_that_fails_is_not_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sart_toolkit.tasks.peg_in_hole.PegInHole.success", lambda *_: False)
+    argv = ["record", "peg_in_hole", "--out", tmp_path / "d.h5", "--image-size", 32]
+    assert "did not reach the goal" in error(capsys, *argv)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in ("run", "record", "suggest", "augment", "train", "evaluate", "info", "doctor"):
+        with pytest.raises(SystemExit) as exit_:
+            main([verb, "--help"])
+        assert exit_.value.code == 0
+        assert f"Example: sart {verb}" in capsys.readouterr().out
+
+
+def test_placement_can_be_random(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "d.h5"
+    argv = ["record", "peg_in_hole", "--out", out, "--placement", "random", "--image-size", 32]
+    said = run(capsys, *argv)
+    placement = load_demonstration(out).task_parameters["placement"]
+    assert said["placement"] == placement
+    assert placement["x"] != 0.0 and abs(placement["x"]) <= 0.05
