@@ -166,6 +166,27 @@ def remove(path: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def clear_directory(path: Path, mark: str, overwrite: bool) -> None:
+    """Make room for a directory that a stage writes: an empty one or none at all is left.
+
+    Args:
+        path: the directory.
+        mark: the file that such a directory holds; one without it is never removed.
+        overwrite: whether such a directory may be replaced.
+
+    Raises:
+        OutputExists: it is there and may not be replaced.
+        CannotWrite: the disk refuses.
+    """
+    path = Path(path)
+    check_writable(path, overwrite)
+    if path.is_dir() and any(path.iterdir()) and not (path / mark).exists():
+        raise OutputExists(
+            f"{path}: holds other things (no {mark}), so it won't be replaced; choose another --out"
+        )
+    remove(path)
+
+
 def _existing(path: Path) -> Path:
     path = Path(path)
     if not path.exists():

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import json
 import logging
-import multiprocessing
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,20 +43,20 @@ from sart_toolkit.records import (
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.storage import (
     annotation_to_json,
-    check_writable,
+    clear_directory,
     episode_name,
     load_annotation,
     load_dataset,
     load_demonstration,
     load_episode,
     read_json,
-    remove,
     save_annotation,
     save_demonstration,
     save_episode,
     write_json,
 )
 from sart_toolkit.teach.recorder import StepRecorder
+from sart_toolkit.workers import worker_map
 
 _log = logging.getLogger(__name__)
 KEPT = "kept"
@@ -166,21 +166,20 @@ def try_segment(
 
 
 class _Worker:
-    """Makes tries and writes kept episodes; one a process."""
+    """Makes tries (sphere, k) and writes the kept episodes of one dataset directory."""
 
     def __init__(
-        self, backend: Backend, demonstration: Demonstration, annotation: Annotation,
-        config: AugmentConfig, directory: Path,
-    ) -> None:  # fmt: skip
-        self._backend = backend
-        self._demonstration = demonstration
-        self._annotation = annotation
-        self._config = config
+        self, make_backend: BackendFactory, directory: Path, config: AugmentConfig
+    ) -> None:
         self._directory = directory
-        self._model = RobotModel(backend.robot, backend.scene.held)
+        self._config = config
+        self._demonstration = load_demonstration(directory / "demo.h5")
+        self._annotation = load_annotation(directory / "annotation.json")
+        self._backend = make_backend()
+        self._model = RobotModel(self._backend.robot, self._backend.scene.held)
 
-    def __call__(self, task: tuple[int, int]) -> tuple[int, int, str]:
-        sphere, k = task
+    def __call__(self, at: tuple[int, int]) -> tuple[int, int, str]:
+        sphere, k = at
         attempt = try_segment(
             self._backend,
             self._model,
@@ -194,21 +193,8 @@ class _Worker:
             save_episode(self._directory / "episodes" / episode_name(sphere, k), attempt.episode)
         return sphere, k, attempt.outcome
 
-
-_worker: _Worker | None = None
-
-
-def _start_worker(
-    make_backend: BackendFactory, annotation: Annotation, config: AugmentConfig, directory: Path
-) -> None:
-    global _worker
-    demonstration = load_demonstration(directory / "demo.h5")
-    _worker = _Worker(make_backend(), demonstration, annotation, config, directory)
-
-
-def _work(task: tuple[int, int]) -> tuple[int, int, str]:
-    assert _worker is not None
-    return _worker(task)
+    def close(self) -> None:
+        self._backend.close()
 
 
 def augment_demonstration(
@@ -245,8 +231,6 @@ def augment_demonstration(
     """
     config = config or AugmentConfig()
     out = Path(out)
-    if workers < 1:
-        raise InvalidInput(f"workers: expected at least 1, got {workers}")
     annotation.check_matches(demonstration)
     if not demonstration.states:
         raise Mismatch(
@@ -261,13 +245,14 @@ def augment_demonstration(
     finished = _prepare(out, request, demonstration, annotation, overwrite)
     if finished is not None:
         return finished
+    _check_capable(make_backend)
     outcomes = _read_attempts(out)
     quotas = [
         len(range(i, config.n - 1, len(annotation.spheres))) for i in range(len(annotation.spheres))
     ]
     with (
         open(out / "attempts.jsonl", "a") as log,
-        _runner(make_backend, demonstration, annotation, config, out, workers) as run,
+        worker_map(functools.partial(_Worker, make_backend, out, config), workers) as run,
     ):
         while batch := _next_batch(outcomes, quotas):
             for sphere, k, outcome in run(batch):
@@ -295,8 +280,7 @@ def _prepare(
             f"{out}: holds a dataset made with other settings; add --overwrite or choose another "
             "--out"
         )
-    check_writable(out, overwrite)
-    remove(out)
+    clear_directory(out, "request.json", overwrite)
     save_demonstration(out / "demo.h5", demonstration)
     save_annotation(out / "annotation.json", annotation)
     (out / "episodes").mkdir()
@@ -341,54 +325,14 @@ def _next_batch(outcomes: dict[tuple[int, int], str], quotas: list[int]) -> list
     return sorted(batch, key=lambda at: (at[1], at[0]))
 
 
-class _runner:
-    """Context that maps tries to outcomes, here or in worker processes."""
-
-    def __init__(
-        self, make_backend: BackendFactory, demonstration: Demonstration, annotation: Annotation,
-        config: AugmentConfig, out: Path, workers: int,
-    ) -> None:  # fmt: skip
-        self._arguments = (make_backend, annotation, config, out)
-        self._demonstration = demonstration
-        self._workers = workers
-        self._pool: ProcessPoolExecutor | None = None
-        self._backend: Backend | None = None
-
-    def __enter__(self) -> Callable[[list[tuple[int, int]]], Iterator[tuple[int, int, str]]]:
-        make_backend, annotation, config, out = self._arguments
-        if self._workers == 1:
-            self._backend = make_backend()
-            _check_capable(self._backend)
-            worker = _Worker(self._backend, self._demonstration, annotation, config, out)
-            return lambda batch: map(worker, batch)
-        probe = make_backend()
-        try:
-            _check_capable(probe)
-        finally:
-            probe.close()
-        self._pool = ProcessPoolExecutor(
-            self._workers,
-            multiprocessing.get_context("spawn"),
-            _start_worker,
-            (make_backend, annotation, config, out),
-        )
-        pool = self._pool
-        return lambda batch: pool.map(_work, batch)
-
-    def __exit__(self, *_: object) -> None:
-        if self._backend is not None:
-            self._backend.close()
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-
-
-def _check_capable(backend: Backend) -> None:
-    can = backend.capabilities
-    if not (can.can_restore and can.has_contacts and can.renders):
-        raise MissingCapability(
-            f"backend {backend.name!r} can't restore states, report contacts and render, which "
-            "augmentation needs; use another backend"
-        )
+def _check_capable(make_backend: BackendFactory) -> None:
+    with closing(make_backend()) as backend:
+        can = backend.capabilities
+        if not (can.can_restore and can.has_contacts and can.renders):
+            raise MissingCapability(
+                f"backend {backend.name!r} can't restore states, report contacts and render, which "
+                "augmentation needs; use another backend"
+            )
 
 
 def _finish(

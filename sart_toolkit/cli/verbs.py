@@ -40,12 +40,12 @@ from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.storage import (
     check_writable,
+    clear_directory,
     load_annotation,
     load_dataset,
     load_demonstration,
     load_episode,
     read_json,
-    remove,
     save_annotation,
     save_demonstration,
     write_json,
@@ -61,7 +61,10 @@ Result = dict[str, Any]
 
 def run_verb(verb: Any) -> None:
     """Carry out a parsed command and print its result."""
-    show(_VERBS[type(verb)](verb), verb.json)
+    result = _VERBS[type(verb)](verb)
+    show(result, verb.json)
+    if result.get("usable") is False:
+        sys.exit(1)
 
 
 def _backend_factory(
@@ -150,8 +153,6 @@ def augment_verb(args: Augment) -> Result:
     make = _backend_factory(
         args.backend or demonstration.backend, task, demonstration.robot, _image_size(demonstration)
     )
-    if args.out.exists() and not args.overwrite and not (args.out / "request.json").exists():
-        check_writable(args.out)
     with progress_bar("augment", args.n - 1, "trajectory") as bar:
 
         def progress(kept: int, wanted: int, rejected: int) -> None:
@@ -185,8 +186,8 @@ def train_verb(args: Train) -> Result:
     config = TrainConfig.for_policy(args.policy, **overrides, seed=args.seed, device=args.device)
     dataset = load_dataset(args.dataset)
     check_writable(args.out / "config.json", args.overwrite)
-    if args.overwrite:
-        remove(args.out)
+    if args.overwrite and (args.out / "config.json").exists():
+        clear_directory(args.out, "config.json", overwrite=True)
     with progress_bar("train", None, "step") as bar:
 
         def progress(done: int, total: int, text: str) -> None:
@@ -234,12 +235,7 @@ def run_whole(args: Run) -> Result:
     state_file = out / "run.json"
     state: Result = {"config": wanted, "stages": {}}
     if args.overwrite:
-        check_writable(out, True)
-        if out.exists() and not state_file.exists() and any(out.iterdir()):
-            raise InvalidInput(
-                f"{out}: is not a run's directory, so it won't be replaced; choose another --out"
-            )
-        remove(out)
+        clear_directory(out, state_file.name, overwrite=True)
     elif state_file.exists():
         state = read_json(state_file)
         if state["config"] != wanted:
@@ -343,9 +339,11 @@ def info_verb(args: Info) -> Result:
 def doctor_verb(args: Doctor) -> Result:
     """`sart doctor`: findings to read, or as data."""
     findings = doctor.diagnose()
+    usable = all(finding.ok for finding in findings if finding.required)
     if args.json:
-        return {"findings": [dataclasses.asdict(finding) for finding in findings]}
-    lines: Result = {}
+        rows = [dataclasses.asdict(finding) for finding in findings]
+        return {"usable": usable, "findings": rows}
+    lines: Result = {"usable": usable}
     for finding in findings:
         mark = "ok  " if finding.ok else ("FAIL" if finding.required else "off ")
         remedy = f"\n      -> {finding.remedy}" if finding.remedy and not finding.ok else ""

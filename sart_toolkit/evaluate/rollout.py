@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import functools
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
+import torch
 
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
@@ -28,9 +29,10 @@ from sart_toolkit.records import (
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.storage import write_json
 from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.workers import worker_map
 
 BackendFactory = Callable[[], Backend]
-_VIDEO_SIZE = 384
+_OVERVIEW, _VIDEO_SIZE = "overview", 384
 
 
 @dataclass(frozen=True)
@@ -139,10 +141,21 @@ def run_rollout(
 
 
 class _Worker:
-    """Runs episodes; one a process."""
+    """Runs episodes of a seed."""
 
-    def __init__(self, skill: Skill, task: Task, make_backend: BackendFactory, seed: int) -> None:
-        self.skill, self.task, self.seed = skill, task, seed
+    def __init__(
+        self,
+        skill_directory: Path,
+        task: Task,
+        make_backend: BackendFactory,
+        seed: int,
+        device: str,
+        threads: int | None,
+    ) -> None:
+        if threads is not None:
+            torch.set_num_threads(threads)
+        self.skill = load_skill(skill_directory, device)
+        self.task, self.seed = task, seed
         self.backend = make_backend()
         self.model = RobotModel(self.backend.robot, self.backend.scene.held)
 
@@ -154,22 +167,8 @@ class _Worker:
             self.skill, self.task, self.backend, self.model, placement, (self.seed, episode), watch
         )
 
-
-_worker: _Worker | None = None
-
-
-def _start_worker(skill: Path, task: Task, make_backend: BackendFactory, seed: int) -> None:
-    import torch
-
-    # The processes share the cores; a thread pool in each would only make them wait.
-    torch.set_num_threads(1)
-    global _worker
-    _worker = _Worker(load_skill(skill), task, make_backend, seed)
-
-
-def _work(episode: int) -> Rollout:
-    assert _worker is not None
-    return _worker(episode)
+    def close(self) -> None:
+        self.backend.close()
 
 
 def evaluate_skill(
@@ -191,7 +190,7 @@ def evaluate_skill(
         config: how many rollouts, from which seed.
         out: where `evaluation.json` is written, `videos/` beside it; `None` writes nothing.
         workers: processes.
-        device: where the policy runs if `workers` is 1.
+        device: where the policy runs.
         progress: called with (done, wanted, successes) after each rollout.
 
     Raises:
@@ -200,52 +199,31 @@ def evaluate_skill(
         CannotWrite: the disk refuses.
     """
     config = config or EvaluateConfig()
-    if workers < 1:
-        raise InvalidInput(f"workers: expected at least 1, got {workers}")
-    skill = load_skill(skill_directory, device)
-    started = time.perf_counter()
-    probe = make_backend()
-    backend = probe.name
-    probe.close()
-    rollouts: list[Rollout] = []
-    for rollout in _rollouts(skill, skill_directory, task, make_backend, config, workers):
-        rollouts.append(rollout)
-        if progress is not None:
-            progress(len(rollouts), config.episodes, sum(r.success for r in rollouts))
-    seconds = time.perf_counter() - started
-    result = _summary(rollouts, skill, task, backend, config, seconds)
-    if out is not None:
-        result["videos"] = _videos(rollouts, skill, task, make_backend, config, out.parent)
-        write_json(out, result)
-    return result
-
-
-def _rollouts(
-    skill: Skill,
-    directory: Path,
-    task: Task,
-    make_backend: BackendFactory,
-    config: EvaluateConfig,
-    workers: int,
-) -> Iterator[Rollout]:
-    episodes = range(config.episodes)
-    if workers == 1:
-        worker = _Worker(skill, task, make_backend, config.eval_seed)
-        try:
-            yield from map(worker, episodes)
-        finally:
-            worker.backend.close()
-        return
-    pool = ProcessPoolExecutor(
-        workers,
-        multiprocessing.get_context("spawn"),
-        _start_worker,
-        (directory, task, make_backend, config.eval_seed),
+    skill = load_skill(skill_directory)
+    # Processes share the cores: a pool of threads in each would only make them wait.
+    make_worker = functools.partial(
+        _Worker,
+        skill_directory,
+        task,
+        make_backend,
+        config.eval_seed,
+        device,
+        None if workers == 1 else 1,
     )
-    try:
-        yield from pool.map(_work, episodes)
-    finally:
-        pool.shutdown(cancel_futures=True)
+    started = time.perf_counter()
+    rollouts: list[Rollout] = []
+    with worker_map(make_worker, workers) as run:
+        for rollout in run(range(config.episodes)):
+            rollouts.append(rollout)
+            if progress is not None:
+                progress(len(rollouts), config.episodes, sum(r.success for r in rollouts))
+    seconds = time.perf_counter() - started
+    with closing(make_worker()) as worker:
+        result = _summary(rollouts, skill, task, worker.backend.name, config, seconds)
+        if out is not None:
+            result["videos"] = _videos(rollouts, worker, config, out.parent)
+            write_json(out, result)
+    return result
 
 
 def _summary(
@@ -280,29 +258,19 @@ def _summary(
 
 
 def _videos(
-    rollouts: list[Rollout],
-    skill: Skill,
-    task: Task,
-    make_backend: BackendFactory,
-    config: EvaluateConfig,
-    directory: Path,
+    rollouts: list[Rollout], worker: _Worker, config: EvaluateConfig, directory: Path
 ) -> list[dict[str, Any]]:
     """Run the first successes and failures again, drawn from outside with the wrist view inset."""
-    chosen = [r for r in rollouts if r.success][: config.videos]
-    chosen += [r for r in rollouts if not r.success][: config.videos]
-    if not chosen or "overview" not in [camera.name for camera in task.scene.cameras]:
+    if _OVERVIEW not in worker.backend.cameras:
         return []
-    worker = _Worker(skill, task, make_backend, config.eval_seed)
     rows = []
-    try:
-        for rollout in chosen:
-            outcome: Outcome = "success" if rollout.success else "failure"
+    for outcome in get_args(Outcome):
+        chosen = [r for r in rollouts if r.success == (outcome == "success")]
+        for rollout in chosen[: config.videos]:
             frames = _film(worker, rollout.episode, outcome)
             name = f"videos/{outcome}_{rollout.episode:03d}.mp4"
             write_video(directory / name, frames, RECORD_HZ)
             rows.append({"path": name, "episode": rollout.episode, "outcome": outcome})
-    finally:
-        worker.backend.close()
     return rows
 
 
@@ -310,7 +278,7 @@ def _film(worker: _Worker, episode: int, outcome: Outcome) -> list[Image]:
     frames: list[Image] = []
 
     def watch(wrist: Image, step: int, success: bool) -> None:
-        view = worker.backend.observe(("overview",), _VIDEO_SIZE).cameras["overview"].rgb
+        view = worker.backend.observe((_OVERVIEW,), _VIDEO_SIZE).cameras[_OVERVIEW].rgb
         detail = "goal reached" if success else ""
         frames.append(caption(inset(view, wrist), episode, step / RECORD_HZ, outcome, detail))
 

@@ -1,4 +1,4 @@
-"""The command line: each verb does its work, and bad input is one line, code 2, nothing replaced."""
+"""The command line: verbs do their work; bad input is one line, code 2, and nothing replaced."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sart_toolkit.evaluate.report import write_report
 
 from sart_toolkit.cli import main
-from sart_toolkit.evaluate.report import write_report
 from sart_toolkit.storage import load_demonstration
 
 
@@ -41,7 +41,9 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("chain")
     main(["record", "peg_in_hole", "--out", f"{out}/demo.h5", "--image-size", "32"])
     main(["suggest", f"{out}/demo.h5", "--out", f"{out}/annotation.json"])
-    main(["augment", f"{out}/demo.h5", f"{out}/annotation.json", "--out", f"{out}/data", "--n", "5"])
+    main(
+        ["augment", f"{out}/demo.h5", f"{out}/annotation.json", "--out", f"{out}/data", "--n", "5"]
+    )
     return out
 
 
@@ -202,7 +204,7 @@ def test_overwrite_of_a_directory_that_is_no_run_is_refused(
 ) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     said = error(capsys, "run", "peg_in_hole", "--out", tmp_path, "--overwrite")
-    assert "is not a run's directory" in said
+    assert "holds other things (no run.json)" in said
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
