@@ -89,8 +89,8 @@ def _train_figures(config: TrainConfig, repeats: int, seconds: float) -> dict[st
     first = torch.arange(config.batch_size) % len(windows.history)
     batch = windows.to(resolve_device(config.device)).batch(first)
     # The first steps choose and compile kernels.
-    n_steps = max(4, round(seconds / _bare_seconds(config, batch, 3)))
-    n_steps = max(4, round(seconds * n_steps / _bare_seconds(config, batch, n_steps) / n_steps))
+    _bare_seconds(config, batch, 2)
+    n_steps = max(4, round(seconds / (_bare_seconds(config, batch, 4) / 4)))
     per_trajectory = _DEMONSTRATION_STEPS // 2 + _SEGMENT_STEPS
     n_windows = n_steps * config.batch_size - _DEMONSTRATION_STEPS
     dataset = _synthetic_dataset(max(1, round(n_windows / per_trajectory)))
@@ -100,7 +100,7 @@ def _train_figures(config: TrainConfig, repeats: int, seconds: float) -> dict[st
             result = train(dataset, config, Path(scratch), resume=False)
             rounds = -(-result.n_windows // config.batch_size)
             n_images = rounds * config.batch_size * config.history
-            bare_rate = n_images / (_bare_seconds(config, batch, rounds) / 1.0)
+            bare_rate = n_images / _bare_seconds(config, batch, rounds)
             _say(
                 f"{config.policy} turn {turn}/{repeats}: loop {result.images_per_second:.0f}, "
                 f"bare {bare_rate:.0f} images/s{' (warming up)' if turn == 0 else ''}"
@@ -108,11 +108,12 @@ def _train_figures(config: TrainConfig, repeats: int, seconds: float) -> dict[st
             if turn > 0:
                 loop.append(result.images_per_second)
                 bare.append(bare_rate)
+    ratios = [a / b for a, b in zip(loop, bare, strict=True)]
     return {
         "loop_images_per_second": statistics.median(loop),
         "bare_images_per_second": statistics.median(bare),
-        "loop_over_bare": statistics.median(a / b for a, b in zip(loop, bare, strict=True)),
-        "loop_over_bare_range": sorted(a / b for a, b in zip(loop, bare, strict=True))[:: repeats - 1 or 1],
+        "loop_over_bare": statistics.median(ratios),
+        "loop_over_bare_range": [min(ratios), max(ratios)],
         "repeats": repeats,
         "steps_per_repeat": rounds,
         "batch_size": config.batch_size,

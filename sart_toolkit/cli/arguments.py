@@ -138,7 +138,8 @@ class Train:
 
     Example: sart train dataset --out skill
 
-    Example: sart train dataset --out skill --policy resnet18_mlp --epochs 12 --lr 3e-4
+    Example: sart train dataset --out skill --policy resnet18_mlp --epochs 20 --lr 3e-4
+        --schedule cosine --image-size 64
     """
 
     dataset: Annotated[
@@ -153,6 +154,12 @@ class Train:
     batch_size: Annotated[int | None, arg(help="The policy's own if left out.")] = None
     image_size: Annotated[
         int | None, arg(help="Pictures are scaled to this [pixels]; the policy's own if left out.")
+    ] = None
+    image_shift: Annotated[
+        int | None, arg(help="Random shift of the pictures, up to this [pixels].")
+    ] = None
+    schedule: Annotated[
+        Literal["cosine", "constant"] | None, arg(help="Course of the learning rate.")
     ] = None
     norm: Annotated[
         Literal["batch", "group"] | None, arg(help="Normalisation layers of resnet18_mlp.")

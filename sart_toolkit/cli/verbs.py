@@ -79,6 +79,12 @@ def _backend_factory(
     )
 
 
+def _train_config(policy: str, **given: Any) -> TrainConfig:
+    """The policy's own options, with those that were given on the command line."""
+    chosen = {name: value for name, value in given.items() if value is not None}
+    return TrainConfig.for_policy(policy, **chosen)
+
+
 def _image_size(demonstration: Demonstration) -> int:
     return next(iter(demonstration.steps.cameras.values())).rgb.shape[1]
 
@@ -174,16 +180,19 @@ def augment_verb(args: Augment) -> Result:
 
 def train_verb(args: Train) -> Result:
     """`sart train`."""
-    given = {
-        "epochs": args.epochs,
-        "lr": args.lr,
-        "batch_size": args.batch_size,
-        "image_size": args.image_size,
-        "norm": args.norm,
-        "backbone_weights": args.backbone_weights and str(args.backbone_weights),
-    }
-    overrides = {name: value for name, value in given.items() if value is not None}
-    config = TrainConfig.for_policy(args.policy, **overrides, seed=args.seed, device=args.device)
+    config = _train_config(
+        args.policy,
+        epochs=args.epochs,
+        lr=args.lr,
+        batch_size=args.batch_size,
+        image_size=args.image_size,
+        image_shift=args.image_shift,
+        schedule=args.schedule,
+        norm=args.norm,
+        backbone_weights=args.backbone_weights and str(args.backbone_weights),
+        seed=args.seed,
+        device=args.device,
+    )
     dataset = load_dataset(args.dataset)
     check_writable(args.out / "config.json", args.overwrite)
     if args.overwrite and (args.out / "config.json").exists():
@@ -227,7 +236,11 @@ def evaluate_verb(args: Evaluate) -> Result:
 
 def run_whole(args: Run) -> Result:
     """`sart run`: each step unless its result is there already, then the report."""
-    get_task(args.task)
+    # What can't work should be said before anything is written.
+    _backend_factory(args.backend, get_task(args.task), args.robot, args.image_size)
+    AugmentConfig(n=args.n, sampling=SamplingConfig(args.law), seed=args.seed)
+    _train_config(args.policy, epochs=args.epochs, seed=args.seed, device=args.device)
+    EvaluateConfig(args.episodes, args.eval_seed)
     out = args.out
     wanted = {
         k: v for k, v in _plain(args).items() if k not in ("out", "overwrite", "json", "workers")
@@ -275,11 +288,14 @@ def run_whole(args: Run) -> Result:
             say(f"{name:<9} done before: {result}")
             continue
         started = time.perf_counter()
-        carry_out()
-        seconds = time.perf_counter() - started
-        before = state["stages"].get(name, 0.0)
-        state["stages"][name] = before + seconds
-        write_json(state_file, state)
+        try:
+            carry_out()
+        finally:
+            # Also what an interrupted stage took, which will be gone on with.
+            seconds = state["stages"].get(name, 0.0) + time.perf_counter() - started
+            state["stages"][name] = seconds
+            write_json(state_file, state)
+        say(f"{name:<9} {seconds:6.1f} s  {result}")
     report = out / "report.html"
     write_report(out, report)
     figures = read_json(evaluation)

@@ -119,8 +119,8 @@ class PegInHole(Task):
 
     def success(self, observation: Observation) -> bool:
         tip, tilt = self._peg_in_hole(observation)
-        inside = bool(np.abs(tip[:2]).max() < 0.012)
-        return inside and tip[2] < -HOLE_DEPTH / 2 and tilt < np.deg2rad(10)
+        inside = np.abs(tip[:2]).max() < 0.012
+        return bool(inside and tip[2] < -HOLE_DEPTH / 2 and tilt < np.deg2rad(10))
 
     def shortfall(self, observation: Observation) -> str:
         tip, tilt = self._peg_in_hole(observation)

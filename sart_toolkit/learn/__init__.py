@@ -1,0 +1,1 @@
+"""Windows over episodes, policies, the one training loop, and trained skills."""

@@ -1,0 +1,465 @@
+"""The one training loop: any policy, CPU or CUDA, resumable to the bit on a CPU."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
+from sart_toolkit.learn.model import Policy
+from sart_toolkit.learn.policies import get_encoder
+from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
+from sart_toolkit.learn.windows import build_windows
+from sart_toolkit.poses import check_positive
+from sart_toolkit.records import Dataset
+
+CHECKPOINT = "checkpoint.safetensors"
+_CHECKPOINT_SECONDS = 30.0
+_WARM_UP = 0.05
+_log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """How a policy is trained; `TrainConfig.for_policy` fills in what suits a policy.
+
+    `epochs` passes over all trajectories in batches of `batch_size` windows; AdamW with `lr` and
+    `weight_decay`; `schedule` is "cosine" (5 % linear warm-up, then down to 0) or "constant".
+    `history` pictures of `camera`, resized to `image_size` [pixels]; each window shifted by up to
+    `image_shift` pixels at random. `hidden`: width of the head. `norm`: the encoder's normalisation
+    layers. `backbone_weights`: a file of weights to start from. `bfloat16`: "auto", "on" or "off".
+    `device`: "auto", "cpu" or "cuda". `threads`: torch's threads, its own choice if None. `seed`
+    decides the initial weights, the order and the shifts.
+    """
+
+    policy: str
+    epochs: int
+    batch_size: int
+    lr: float
+    weight_decay: float
+    schedule: str
+    image_size: int
+    image_shift: int
+    norm: str
+    history: int = 2
+    hidden: int = 512
+    camera: str = "wrist"
+    backbone_weights: str | None = None
+    bfloat16: str = "auto"
+    device: str = "auto"
+    threads: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        encoder = get_encoder(self.policy)
+        for name, least in (
+            ("epochs", 1),
+            ("batch_size", 2),
+            ("image_size", 16),
+            ("image_shift", 0),
+            ("history", 1),
+            ("hidden", 1),
+            ("seed", 0),
+        ):
+            _check_whole(name, getattr(self, name), least)
+        if self.threads is not None:
+            _check_whole("threads", self.threads, 1)
+        check_positive("lr", self.lr)
+        if not (math.isfinite(self.weight_decay) and self.weight_decay >= 0):
+            raise InvalidInput(f"weight_decay: expected a number >= 0, got {self.weight_decay}")
+        if self.image_shift > self.image_size // 4:
+            raise InvalidInput(
+                f"image_shift: expected at most a quarter of image_size {self.image_size}, got "
+                f"{self.image_shift}; shift less"
+            )
+        for name, choices in (
+            ("schedule", ("cosine", "constant")),
+            ("bfloat16", ("auto", "on", "off")),
+            ("device", ("auto", "cpu", "cuda")),
+            ("norm", encoder.norms),
+        ):
+            if getattr(self, name) not in choices:
+                raise InvalidInput(
+                    f"{name}: expected {' or '.join(choices)} with policy {self.policy}, got "
+                    f"{getattr(self, name)!r}"
+                )
+
+    @classmethod
+    def for_policy(cls, policy: str, **overrides: Any) -> TrainConfig:
+        """The options that suit a policy, some of them replaced.
+
+        Raises:
+            UnknownName: no such policy, or no such option.
+            InvalidInput: a value is not acceptable.
+        """
+        return cls.from_json({"policy": policy, **get_encoder(policy).train_defaults, **overrides})
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> TrainConfig:
+        """The configuration in JSON values.
+
+        Raises:
+            UnknownName: an option that doesn't exist.
+            InvalidInput: an option is missing or not acceptable.
+        """
+        fields = dataclasses.fields(cls)
+        names = [field.name for field in fields]
+        for name in value:
+            if name not in names:
+                raise unknown_name("training option", name, names)
+        for field in fields:
+            if field.name not in value and field.default is dataclasses.MISSING:
+                raise InvalidInput(f"training options: {field.name!r} is missing; add it")
+        return cls(**value)
+
+    def to_json(self) -> dict[str, Any]:
+        """The configuration as JSON values."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """One epoch: its number from 1, mean training loss, and seconds it took."""
+
+    epoch: int
+    loss: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """A trained policy (on the CPU, in evaluation mode) and how its training went.
+
+    `images_per_second` counts every picture of every window's history. `bfloat16` and `device`
+    are what "auto" came to.
+    """
+
+    policy: Policy
+    config: TrainConfig
+    curve: tuple[EpochRecord, ...]
+    images_per_second: float
+    n_windows: int
+    device: str
+    bfloat16: bool
+
+    @property
+    def final_loss(self) -> float:
+        """Mean training loss of the last epoch (normalised actions)."""
+        return self.curve[-1].loss
+
+    @property
+    def seconds(self) -> float:
+        """Seconds spent in the loop, resumed parts included."""
+        return sum(record.seconds for record in self.curve)
+
+
+def build_policy(config: TrainConfig) -> Policy:
+    """An untrained policy with the initial weights that `config.seed` decides, on the CPU."""
+    encoder_class = get_encoder(config.policy)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        policy = Policy(
+            encoder_class(config.image_size, config.norm), config.history, config.hidden
+        )
+    # torch's type stubs leave this argument out. Convolutions on a CPU are several times faster so.
+    return policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def resolve_device(name: str) -> torch.device:
+    """The device that "auto", "cpu" or "cuda" means on this machine.
+
+    Raises:
+        InvalidInput: CUDA was asked for and torch finds none.
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InvalidInput("device 'cuda': torch finds no CUDA device here; use --device cpu")
+    return torch.device(name)
+
+
+def resolve_bfloat16(setting: str, device: torch.device) -> bool:
+    """Whether to compute convolutions in bfloat16 on a device.
+
+    "auto" says yes where the processor multiplies bfloat16 natively. Measured with both policies
+    on AVX-512-BF16/AMX that is 1.6 to 2.5 times as fast; without it, torch emulates it slowly.
+    """
+    if setting != "auto":
+        return setting == "on"
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities()
+    return any(bool(capabilities.get(name)) for name in ("avx512_bf16", "amx_bf16"))
+
+
+def learning_rate(config: TrainConfig, step: int, n_steps: int) -> float:
+    """The learning rate of a step, counted from 0, of `n_steps`."""
+    if config.schedule == "constant":
+        return config.lr
+    warm_up = max(1, round(_WARM_UP * n_steps))
+    if step < warm_up:
+        return config.lr * (step + 1) / warm_up
+    return config.lr * 0.5 * (1.0 + math.cos(math.pi * (step - warm_up) / (n_steps - warm_up)))
+
+
+def make_optimizer(policy: Policy, config: TrainConfig) -> torch.optim.AdamW:
+    """AdamW over all of a policy's weights, its update fused into one pass."""
+    return torch.optim.AdamW(
+        policy.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
+    )
+
+
+def train(
+    dataset: Dataset,
+    config: TrainConfig,
+    out: Path,
+    progress: Progress | None = None,
+    resume: bool = True,
+) -> TrainResult:
+    """A policy trained on a dataset.
+
+    Checkpoints go to `out` every 30 seconds, at the end, and when interrupted (Ctrl-C lets the step
+    finish, a second one does not). A later call with the same dataset and options goes on
+    from there, and ends with the weights of an uninterrupted run, bit for bit on the same CPU with
+    the same number of threads.
+
+    Args:
+        dataset: the demonstration and its episodes.
+        config: how to train.
+        out: directory of the checkpoint; made if needed.
+        progress: called after every step with steps done, steps in all, and a line of text.
+        resume: go on from a checkpoint in `out` if there is one; otherwise it is replaced.
+
+    Raises:
+        UnknownName: the dataset has no such camera.
+        InvalidInput: CUDA was asked for and isn't there, or the encoder takes no backbone weights.
+        Mismatch: the dataset's parts don't belong together, the checkpoint is of other options or
+            another dataset, or the backbone weights don't fit.
+        MissingFile: no such backbone weights.
+        BrokenFile: damaged checkpoint or backbone weights.
+        CannotWrite: the disk refuses the checkpoint.
+        SartError: the loss is not finite any more.
+    """
+    device = resolve_device(config.device)
+    with _torch_threads(config.threads), _deferred_interrupt() as interrupted:
+        return _Training(dataset, config, Path(out), device, resume).run(progress, interrupted)
+
+
+class _Training:
+    """What a run changes as it goes: weights, optimizer, and the place in the epoch."""
+
+    def __init__(
+        self, dataset: Dataset, config: TrainConfig, out: Path, device: torch.device, resume: bool
+    ) -> None:
+        self.config = config
+        self.device = device
+        self.bfloat16 = resolve_bfloat16(config.bfloat16, device)
+        self.checkpoint = out / CHECKPOINT
+        windows = build_windows(dataset, config.camera, config.image_size, config.history)
+        # Where it ran decides rounding, not what is learned: those options may change.
+        self.options = {k: v for k, v in config.to_json().items() if k not in ("device", "threads")}
+        self.data_hash = windows.content_hash()
+        self.n_windows = int(windows.multiplicity.sum())
+        self.n_batches = math.ceil(self.n_windows / config.batch_size)
+
+        going_on = resume and self.checkpoint.exists()
+        self.policy = build_policy(config)
+        self.policy.set_normalisation(windows.normalisation())
+        if config.backbone_weights is not None and not going_on:
+            self.policy.encoder.load_backbone(Path(config.backbone_weights))
+        self.policy.to(device)
+        self.optimizer = make_optimizer(self.policy, config)
+        self.windows = windows.padded(config.image_shift).to(device)
+
+        self.curve: list[EpochRecord] = []
+        self.batch = 0
+        self.loss_sum = torch.zeros((), dtype=torch.float64, device=device)
+        self.seconds = 0.0
+        if going_on:
+            self._restore()
+
+    def run(self, progress: Progress | None, interrupted: Callable[[], bool]) -> TrainResult:
+        config, n_steps = self.config, self.config.epochs * self.n_batches
+        self.policy.train()
+        saved = time.perf_counter()
+        for epoch in range(len(self.curve), config.epochs):
+            began = time.perf_counter() - self.seconds
+            batches = self._epoch_batches(epoch)
+            for batch in range(self.batch, self.n_batches):
+                step = epoch * self.n_batches + batch
+                for group in self.optimizer.param_groups:
+                    group["lr"] = learning_rate(config, step, n_steps)
+                self._step(*batches[batch])
+                self.batch = batch + 1
+                if progress is not None:
+                    progress(step + 1, n_steps, self._status())
+                self.seconds = time.perf_counter() - began
+                if interrupted() or time.perf_counter() - saved > _CHECKPOINT_SECONDS:
+                    self._save()
+                    saved = time.perf_counter()
+                if interrupted():
+                    _log.warning("interrupted after step %d; train again to go on", step + 1)
+                    raise KeyboardInterrupt
+            loss = self._finite_loss() / self.n_windows
+            self.curve.append(EpochRecord(epoch + 1, loss, time.perf_counter() - began))
+            self.batch, self.seconds = 0, 0.0
+            self.loss_sum.zero_()
+        self._save()
+        return self._result()
+
+    def _epoch_batches(self, epoch: int) -> list[tuple[Tensor, Tensor]]:
+        rng = np.random.default_rng([self.config.seed, epoch])
+        order = self.windows.epoch_order(rng)
+        offsets = rng.integers(0, 2 * self.config.image_shift + 1, (len(order), 2))
+        # Batches that differ by at most one window: a small last batch would disturb BatchNorm.
+        return [
+            (torch.from_numpy(a).to(self.device), torch.from_numpy(b).to(self.device))
+            for a, b in zip(
+                np.array_split(order, self.n_batches),
+                np.array_split(offsets, self.n_batches),
+                strict=True,
+            )
+        ]
+
+    def _step(self, windows: Tensor, offsets: Tensor) -> None:
+        frames, gripper, actions = self.windows.batch(windows, offsets)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
+            loss = self.policy.loss(frames, gripper, actions)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        # Kept on the device: reading it each step would make a GPU wait.
+        self.loss_sum += loss.detach() * len(windows)
+
+    def _finite_loss(self) -> float:
+        total = float(self.loss_sum)
+        if not math.isfinite(total):
+            raise SartError(
+                f"training loss became {total} in epoch {len(self.curve) + 1}; lower lr (now "
+                f"{self.config.lr:g}) or set bfloat16 off"
+            )
+        return total
+
+    def _status(self) -> str:
+        epochs = f"epoch {len(self.curve) + 1}/{self.config.epochs}"
+        return f"{epochs}, loss {self.curve[-1].loss:.4g}" if self.curve else epochs
+
+    def _result(self) -> TrainResult:
+        seconds = sum(record.seconds for record in self.curve)
+        n_images = self.n_windows * self.config.history * len(self.curve)
+        return TrainResult(
+            policy=self.policy.cpu().eval(),
+            config=self.config,
+            curve=tuple(self.curve),
+            images_per_second=n_images / seconds,
+            n_windows=self.n_windows,
+            device=self.device.type,
+            bfloat16=self.bfloat16,
+        )
+
+    def _save(self) -> None:
+        tensors = {f"policy/{k}": v for k, v in self.policy.state_dict().items()}
+        for i, parameter in enumerate(self.policy.parameters()):
+            for name, value in self.optimizer.state[parameter].items():
+                tensors[f"optimizer/{i}/{name}"] = value
+        about = {
+            "options": self.options,
+            "data_hash": self.data_hash,
+            "batch": self.batch,
+            "loss_sum": self._finite_loss(),
+            "seconds": self.seconds,
+            "curve": [dataclasses.asdict(record) for record in self.curve],
+        }
+        save_tensors(self.checkpoint, tensors, about)
+
+    def _restore(self) -> None:
+        tensors, about = load_tensors(self.checkpoint)
+        changed = [k for k, v in self.options.items() if about["options"].get(k) != v]
+        if about["data_hash"] != self.data_hash:
+            changed.append("training data")
+        if changed:
+            raise Mismatch(
+                f"{self.checkpoint}: was made with other {', '.join(changed)}; restore them, "
+                "choose another --out, or start again with --overwrite"
+            )
+        try:
+            self.policy.load_state_dict(
+                {
+                    k.removeprefix("policy/"): v
+                    for k, v in tensors.items()
+                    if k.startswith("policy/")
+                }
+            )
+            for i, parameter in enumerate(self.policy.parameters()):
+                moments = {
+                    # The moments must lie in memory as the weights do.
+                    name: torch.empty_like(parameter).copy_(tensors[f"optimizer/{i}/{name}"])
+                    for name in ("exp_avg", "exp_avg_sq")
+                }
+                step = tensors[f"optimizer/{i}/step"].to(self.device)
+                self.optimizer.state[parameter] = {"step": step, **moments}
+        except (KeyError, RuntimeError) as error:
+            raise Mismatch(
+                f"{self.checkpoint}: does not fit this version's {self.config.policy}; start again "
+                "with --overwrite"
+            ) from error
+        self.batch, self.seconds = about["batch"], about["seconds"]
+        self.loss_sum.fill_(about["loss_sum"])
+        self.curve = [EpochRecord(**record) for record in about["curve"]]
+
+
+@contextlib.contextmanager
+def _torch_threads(threads: int | None) -> Iterator[None]:
+    before = torch.get_num_threads()
+    try:
+        if threads is not None:
+            torch.set_num_threads(threads)
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """A function that tells whether Ctrl-C was pressed; the second one interrupts at once.
+
+    Only a step that has finished leaves weights, optimizer and counters that belong together.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+        yield lambda: False
+        return
+    pressed = False
+
+    def handle(signum: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        if pressed:
+            raise KeyboardInterrupt
+        pressed = True
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, before or signal.default_int_handler)
+
+
+def _check_whole(name: str, value: Any, least: int) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise InvalidInput(f"{name}: expected a whole number >= {least}, got {value!r}")

@@ -1,0 +1,571 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import shutil
+import subprocess
+import sys
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration, try_segment
+from sart_toolkit.augment.strategies import STRATEGIES
+from sart_toolkit.backends.interface import Backend, Capabilities
+from sart_toolkit.errors import (
+    CannotWrite,
+    InvalidInput,
+    Mismatch,
+    MissingCapability,
+    OutputExists,
+    SartError,
+    UnknownName,
+)
+from sart_toolkit.motion.controller import ToolController
+from sart_toolkit.poses import interpolate, log_rotation
+from sart_toolkit.records import apply_action, convergence_waypoint
+from sart_toolkit.storage import load_dataset
+
+CROWDED = AugmentConfig(n=5, seed=3, duration=0.8)
+
+
+@pytest.fixture
+def augment(peg_demonstration, make_peg_backend):
+    """Augments the peg-in-hole demonstration."""
+
+    def augment(annotation, out, config=CROWDED, **options):
+        return augment_demonstration(
+            peg_demonstration, annotation, make_peg_backend, out, config, **options
+        )
+
+    return augment
+
+
+@pytest.fixture(scope="module")
+def crowded_dataset(peg_demonstration, crowded, make_peg_backend, tmp_path_factory):
+    """Made without interruption by one process."""
+    out = tmp_path_factory.mktemp("crowded") / "dataset"
+    return augment_demonstration(peg_demonstration, crowded, make_peg_backend, out, CROWDED)
+
+
+@pytest.fixture(scope="module", params=STRATEGIES)
+def strategy_dataset(
+    request, peg_demonstration, peg_annotation, make_peg_backend, tmp_path_factory
+):
+    out = tmp_path_factory.mktemp(request.param) / "dataset"
+    config = AugmentConfig(n=9, strategy=request.param)
+    return augment_demonstration(peg_demonstration, peg_annotation, make_peg_backend, out, config)
+
+
+class Interrupt:
+    """A progress callback that interrupts after some tries."""
+
+    def __init__(self, after):
+        self.calls, self.after = [], after
+
+    def __call__(self, kept, wanted, rejected):
+        self.calls.append((kept, wanted, rejected))
+        if len(self.calls) == self.after:
+            raise KeyboardInterrupt
+
+
+# --- what an episode is -------------------------------------------------------------------------
+
+
+def test_a_commanded_pose_followed_by_its_action_is_the_next_commanded_pose(strategy_dataset):
+    """Through the reversed segment, across the join, and on to the end."""
+    demonstration = strategy_dataset.demonstration
+    assert len(strategy_dataset.episodes) == 8
+    for episode in strategy_dataset.episodes:
+        Ts, gripper = episode.commands(demonstration)
+        actions = episode.actions(demonstration)
+        assert (
+            len(Ts)
+            == len(actions)
+            == len(episode) + len(demonstration) - (episode.provenance.t_star)
+        )
+        for t in range(len(Ts) - 1):
+            T, g = apply_action(Ts[t], actions[t])
+            np.testing.assert_allclose(T, Ts[t + 1], rtol=0, atol=1e-9)
+            assert g == gripper[t + 1]
+        assert not actions[-1, :6].any()
+        suffix = demonstration.steps.commanded_Ts_world_tool[episode.provenance.t_star :]
+        np.testing.assert_array_equal(Ts[len(episode) :], suffix)
+
+
+def test_a_segment_is_commanded_along_the_straight_line_from_the_sampled_pose_to_t_star(
+    strategy_dataset,
+):
+    steps = strategy_dataset.demonstration.steps
+    for episode in strategy_dataset.episodes:
+        goal = steps.commanded_Ts_world_tool[episode.provenance.t_star]
+        start = episode.provenance.T_world_sampled
+        commanded = episode.steps.commanded_Ts_world_tool
+        np.testing.assert_allclose(commanded[0], start, rtol=0, atol=1e-9)
+        way = goal[:3, 3] - start[:3, 3]
+        shares = (commanded[:, :3, 3] - start[:3, 3]) @ way / (way @ way)
+        assert (np.diff(shares) > 0).all() and shares[-1] < 1
+        for s, T in zip(shares, commanded, strict=True):
+            np.testing.assert_allclose(T, interpolate(start, goal, s), rtol=0, atol=1e-7)
+        turned = [np.linalg.norm(log_rotation(start[:3, :3].T @ T[:3, :3])) for T in commanded]
+        whole = np.linalg.norm(log_rotation(start[:3, :3].T @ goal[:3, :3]))
+        np.testing.assert_allclose(turned, shares * whole, atol=1e-7)
+
+
+def test_an_episode_says_where_it_comes_from(strategy_dataset, peg_annotation):
+    demonstration = strategy_dataset.demonstration
+    config = strategy_dataset.info["config"]
+    for episode in strategy_dataset.episodes:
+        p = episode.provenance
+        sphere = peg_annotation.spheres[p.sphere]
+        assert p.demonstration_hash == demonstration.content_hash()
+        assert p.strategy == config["strategy"] and p.seed == config["seed"]
+        assert sphere.waypoint < p.t_star < len(demonstration)
+
+
+def test_by_the_paper_s_strategy_an_episode_starts_on_its_sphere_and_joins_at_t_star(
+    peg_dataset, peg_annotation
+):
+    for episode in peg_dataset.episodes:
+        p = episode.provenance
+        sphere = peg_annotation.spheres[p.sphere]
+        offset = p.T_world_sampled[:3, 3] - sphere.T_world_key[:3, 3]
+        assert np.linalg.norm(offset) == pytest.approx(sphere.radius, abs=1e-12)
+        assert p.t_star == convergence_waypoint(peg_dataset.demonstration, sphere)
+        assert len(episode) == 20, "two seconds at 10 Hz"
+
+
+def test_the_measured_tool_follows_the_commands_and_the_join_is_smooth(strategy_dataset):
+    steps = strategy_dataset.demonstration.steps
+    for episode in strategy_dataset.episodes:
+        commanded, measured = (
+            episode.steps.commanded_Ts_world_tool[:, :3, 3],
+            episode.steps.measured_Ts_world_tool[:, :3, 3],
+        )
+        assert np.linalg.norm(commanded - measured, axis=1).max() < 0.003
+        ahead = steps.measured_Ts_world_tool[episode.provenance.t_star, :3, 3]
+        stride = np.linalg.norm(np.diff(measured, axis=0), axis=1).max()
+        assert np.linalg.norm(measured[-1] - ahead) < 1.2 * stride + 0.003
+
+
+def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_the_bit(
+    strategy_dataset, peg_backend, peg_model
+):
+    demonstration = strategy_dataset.demonstration
+    for episode in strategy_dataset.episodes[:4]:
+        t = episode.provenance.t_star
+        peg_backend.restore(demonstration.states[t])
+        controller = ToolController(peg_model)
+        controller.reset(
+            demonstration.steps.commanded_joint_positions[t],
+            demonstration.steps.commanded_Ts_world_tool[t],
+        )
+        steps = episode.steps
+        for i in reversed(range(len(steps))):
+            now = peg_backend.observe().T_world_tool
+            for q in controller.move(steps.commanded_Ts_world_tool[i], now, 3):
+                peg_backend.command(q, steps.commanded_gripper[i])
+                peg_backend.step()
+                assert peg_backend.contacts() == []
+            seen = peg_backend.observe(("wrist",))
+            np.testing.assert_array_equal(seen.q, steps.joint_positions[i])
+            np.testing.assert_array_equal(seen.T_world_tool, steps.measured_Ts_world_tool[i])
+            picture = steps.cameras["wrist"]
+            np.testing.assert_array_equal(seen.cameras["wrist"].rgb, picture.rgb[i])
+            np.testing.assert_array_equal(seen.cameras["wrist"].depth, picture.depth[i])
+
+
+def test_a_try_depends_on_seed_sphere_and_number_alone(
+    peg_demonstration, peg_annotation, peg_backend, peg_model, peg_dataset
+):
+    config = AugmentConfig(n=5)
+    for episode in reversed(peg_dataset.episodes):
+        p = episode.provenance
+        again = try_segment(
+            peg_backend, peg_model, peg_demonstration, peg_annotation, config, p.sphere, p.k
+        )
+        assert again.outcome == "kept"
+        assert again.episode.content_hash() == episode.content_hash()
+
+
+# --- what is kept, rejected and counted ---------------------------------------------------------
+
+
+def test_quotas_go_round_robin_over_the_spheres(peg_annotation, augment, tmp_path):
+    n = 4 + 2 * len(peg_annotation.spheres)
+    dataset = augment(peg_annotation, tmp_path / "d", AugmentConfig(n=n))
+    made = Counter(episode.provenance.sphere for episode in dataset.episodes)
+    quotas = [len(range(i, n - 1, len(peg_annotation.spheres))) for i in made]
+    assert [made[i] for i in made] == quotas
+    assert dataset.info["n_trajectories"] == n
+
+
+def test_tries_that_touch_are_rejected_and_counted_by_what_touched(crowded_dataset):
+    info = crowded_dataset.info
+    assert len(crowded_dataset.episodes) == info["n_kept"] == 4
+    assert info["rejections"]["contact block / peg"] > 0
+    assert all(isinstance(count, int) for count in info["rejections"].values())
+    assert info["n_attempted"] == info["n_kept"] + sum(info["rejections"].values())
+    assert info["simulated_seconds"] == pytest.approx(0.8 * info["n_attempted"])
+    assert info["content_hash"] == crowded_dataset.content_hash()
+
+
+def test_a_sphere_that_gives_nothing_leaves_fewer_trajectories_and_a_warning(
+    annotate, augment, tmp_path, caplog
+):
+    with caplog.at_level(logging.WARNING):
+        dataset = augment(
+            annotate((0, 0.01), (34, 1.5)), tmp_path / "d", AugmentConfig(n=3, duration=0.5)
+        )
+    assert [episode.provenance.sphere for episode in dataset.episodes] == [0]
+    assert "only 1 of 2 trajectories were kept (" in caplog.text
+    assert sum(dataset.info["rejections"].values()) == 20
+
+
+def test_when_every_try_is_rejected_the_error_counts_the_reasons(annotate, augment, tmp_path):
+    calls = Interrupt(None)
+    for expected in (20, 0):
+        with pytest.raises(
+            InvalidInput, match=r"none of 20 tries was kept \(.*out of reach: .*\); use smaller"
+        ):
+            augment(annotate((0, 1.5)), tmp_path / "d", AugmentConfig(n=2), progress=calls)
+        # The second time the answer is known.
+        assert len(calls.calls) == expected
+        calls.calls.clear()
+
+
+def test_a_line_too_fast_for_the_joints_is_one_reason_whatever_time_it_needs(
+    annotate, augment, tmp_path
+):
+    config = AugmentConfig(n=2, duration=0.1)
+    with pytest.raises(InvalidInput, match=r"none of 20 tries was kept \(motion: [^)]*: 20\)"):
+        augment(annotate((0, 0.1)), tmp_path / "d", config)
+
+
+def test_a_line_faster_than_the_tool_may_lead_is_rejected(
+    annotate, peg_demonstration, peg_backend, peg_model
+):
+    config = AugmentConfig(duration=0.5)
+    outcomes = {
+        try_segment(
+            peg_backend, peg_model, peg_demonstration, annotate((0, 0.1)), config, 0, k
+        ).outcome
+        for k in range(12)
+    }
+    assert "tool lags behind the line" in outcomes
+
+
+def test_progress_counts_kept_and_rejected_tries(augment, crowded, crowded_dataset, tmp_path):
+    calls = Interrupt(None)
+    dataset = augment(crowded, tmp_path / "d", progress=calls)
+    assert [kept + rejected for kept, _, rejected in calls.calls] == list(
+        range(1, dataset.info["n_attempted"] + 1)
+    )
+    assert calls.calls[-1] == (4, 4, sum(dataset.info["rejections"].values()))
+    assert dataset.content_hash() == crowded_dataset.content_hash()
+
+
+# --- the same bytes -----------------------------------------------------------------------------
+
+
+def test_two_processes_generate_the_same_as_one(augment, crowded, crowded_dataset, tmp_path):
+    dataset = augment(crowded, tmp_path / "d", workers=2)
+    assert dataset.content_hash() == crowded_dataset.content_hash()
+    assert dataset.info["rejections"] == crowded_dataset.info["rejections"]
+    assert dataset.info["n_attempted"] == crowded_dataset.info["n_attempted"]
+
+
+@pytest.fixture(scope="module")
+def interrupted(peg_demonstration, crowded, make_peg_backend, tmp_path_factory):
+    """The directory of `crowded_dataset` as an interruption after its first kept tries left it."""
+    out = tmp_path_factory.mktemp("interrupted") / "dataset"
+
+    def progress(kept, wanted, rejected):
+        if kept == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        augment_demonstration(
+            peg_demonstration, crowded, make_peg_backend, out, CROWDED, progress=progress
+        )
+    return out
+
+
+@pytest.mark.parametrize("after", [1, 6])
+def test_an_interruption_changes_nothing_that_is_generated(
+    augment, crowded, crowded_dataset, tmp_path, after
+):
+    with pytest.raises(KeyboardInterrupt):
+        augment(crowded, tmp_path / "d", progress=Interrupt(after))
+    log = (tmp_path / "d" / "attempts.jsonl").read_text().splitlines()
+    assert len(log) == after
+    resumed = Interrupt(None)
+    dataset = augment(crowded, tmp_path / "d", progress=resumed)
+    assert dataset.content_hash() == crowded_dataset.content_hash()
+    assert dataset.info["rejections"] == crowded_dataset.info["rejections"]
+    assert len(resumed.calls) == dataset.info["n_attempted"] - after
+    assert load_dataset(tmp_path / "d").content_hash() == dataset.content_hash()
+
+
+def _flip_a_joint_angle(path, episode):
+    content = bytearray(path.read_bytes())
+    at = content.find(episode.steps.joint_positions.tobytes())
+    assert at > 0
+    content[at + 3] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda path, _: path.write_bytes(path.read_bytes()[:5000]), id="truncated"),
+        pytest.param(lambda path, _: path.unlink(), id="deleted"),
+        pytest.param(_flip_a_joint_angle, id="one bit flipped"),
+    ],
+)
+def test_a_damaged_episode_file_is_made_again_on_resuming(
+    augment, crowded, crowded_dataset, interrupted, tmp_path, damage
+):
+    out = shutil.copytree(interrupted, tmp_path / "d")
+    tried = len((out / "attempts.jsonl").read_text().splitlines())
+    path = sorted((out / "episodes").iterdir())[0]
+    names = dict(zip(crowded_dataset.info["episodes"], crowded_dataset.episodes, strict=True))
+    damage(path, names[path.name])
+    resumed = Interrupt(None)
+    dataset = augment(crowded, out, progress=resumed)
+    assert dataset.content_hash() == crowded_dataset.content_hash()
+    assert len(resumed.calls) == dataset.info["n_attempted"] - tried + 1
+
+
+def test_a_log_whose_last_line_was_cut_is_resumed(
+    augment, crowded, crowded_dataset, interrupted, tmp_path
+):
+    out = shutil.copytree(interrupted, tmp_path / "d")
+    log = out / "attempts.jsonl"
+    log.write_text(log.read_text()[:-9])
+    assert augment(crowded, out).content_hash() == crowded_dataset.content_hash()
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    assert len(rows) == crowded_dataset.info["n_attempted"]
+
+
+_CHAIN = """
+import sys
+import numpy as np
+from pathlib import Path
+from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
+from sart_toolkit.backends import make_backend
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks.task import Placement
+from sart_toolkit.teach.scripted import ScriptedOperator
+from sart_toolkit.teach.session import record_demonstration
+from sart_toolkit.teach.suggest import suggest_annotation
+
+task = get_task("peg_in_hole")
+robot = get_robot(task.robot)
+model = RobotModel(robot, task.scene.held)
+make = lambda: make_backend("pybullet", robot, task.scene, int(sys.argv[2]))
+operator = ScriptedOperator(
+    task.plan(task.initial_state(model, Placement())), np.random.default_rng(0)
+)
+demonstration = record_demonstration(make(), task, model, operator, seed=0)
+annotation = suggest_annotation(demonstration, robot, task.scene)
+config = AugmentConfig(n=5)
+dataset = augment_demonstration(demonstration, annotation, make, Path(sys.argv[1]), config)
+print()
+print(dataset.content_hash())
+"""
+
+
+def test_another_process_generates_the_same_from_the_same_seeds(peg_dataset, tmp_path):
+    size = peg_dataset.demonstration.steps.cameras["wrist"].rgb.shape[1]
+    result = subprocess.run(
+        [sys.executable, "-c", _CHAIN, str(tmp_path / "d"), str(size)],
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.splitlines()[-1] == peg_dataset.content_hash()
+
+
+def test_another_seed_generates_something_else(peg_annotation, augment, peg_dataset, tmp_path):
+    other = augment(peg_annotation, tmp_path / "d", AugmentConfig(n=5, seed=1))
+    assert other.content_hash() != peg_dataset.content_hash()
+
+
+def test_a_finished_dataset_is_returned_without_another_try(
+    augment, crowded, crowded_dataset, tmp_path
+):
+    augment(crowded, tmp_path / "d")
+    again = augment(crowded, tmp_path / "d", progress=Interrupt(1), workers=2)
+    assert again.content_hash() == crowded_dataset.content_hash()
+    assert again.info["seconds"] > 0
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_directory_made_with_other_settings_is_left_alone_unless_overwritten(
+    annotate, augment, tmp_path, finished
+):
+    annotation, out = annotate((0, 0.03)), tmp_path / "d"
+    config = AugmentConfig(n=3, duration=0.8)
+    if finished:
+        augment(annotation, out, config)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            augment(annotation, out, config, progress=Interrupt(1))
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    for changed in (
+        lambda: augment(annotation, out, dataclasses.replace(config, n=2)),
+        lambda: augment(annotation, out, dataclasses.replace(config, seed=1)),
+        lambda: augment(annotate((0, 0.031)), out, config),
+    ):
+        with pytest.raises(OutputExists, match="made with other settings; add --overwrite"):
+            changed()
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+    smaller = augment(annotation, out, dataclasses.replace(config, n=2), overwrite=True)
+    assert len(smaller.episodes) == 1
+    assert len(list((out / "episodes").iterdir())) == 1
+
+
+def test_a_directory_with_something_else_in_it_is_left_alone(annotate, augment, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputExists, match="already exists; add --overwrite"):
+        augment(annotate((0, 0.05)), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_place_that_cannot_be_written_is_refused(annotate, augment, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CannotWrite, match="is not a directory"):
+        augment(annotate((0, 0.05)), tmp_path / "file" / "d")
+
+
+def test_an_annotation_of_another_demonstration_is_refused(peg_annotation, augment, tmp_path):
+    other = dataclasses.replace(peg_annotation, demonstration_hash="0" * 64)
+    with pytest.raises(Mismatch, match="made for another demonstration"):
+        augment(other, tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_demonstration_without_states_is_refused(
+    peg_demonstration, peg_annotation, make_peg_backend, tmp_path
+):
+    bare = dataclasses.replace(peg_demonstration, states=())
+    with pytest.raises(Mismatch, match="holds no saved states"):
+        augment_demonstration(bare, peg_annotation, make_peg_backend, tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+
+
+class Arm(Backend):
+    """A made-up robot without any of the capabilities that augmentation needs."""
+
+    name = "arm"
+    capabilities = Capabilities(False, False, False, False)
+    open = 0
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        Arm.open += 1
+
+    def close(self):
+        Arm.open -= 1
+
+    def reset(self, state):
+        raise self._lacks("reset")
+
+    def observe(self, cameras=(), image_size=None):
+        raise self._lacks("render")
+
+    def command(self, q, gripper):
+        raise self._lacks("move")
+
+    def step(self):
+        raise self._lacks("step")
+
+    def save(self):
+        raise self._lacks("save states")
+
+    def restore(self, state):
+        raise self._lacks("restore states")
+
+    def contacts(self):
+        raise self._lacks("report contacts")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_backend_that_lacks_a_capability_is_refused_and_closed(
+    peg_demonstration, peg_annotation, peg_backend, tmp_path, workers
+):
+    def make():
+        return Arm(peg_backend.robot, peg_backend.scene)
+
+    with pytest.raises(MissingCapability, match="backend 'arm' can't restore states, report"):
+        augment_demonstration(
+            peg_demonstration, peg_annotation, make, tmp_path / "d", workers=workers
+        )
+    assert Arm.open == 0
+
+
+def test_a_try_on_a_backend_that_cannot_restore_is_refused(
+    peg_demonstration, peg_annotation, peg_backend, peg_model
+):
+    arm = Arm(peg_backend.robot, peg_backend.scene)
+    with pytest.raises(MissingCapability, match="can't restore states; use another backend"):
+        try_segment(arm, peg_model, peg_demonstration, peg_annotation, AugmentConfig(), 0, 0)
+    arm.close()
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_at_least_one_process_is_needed(annotate, augment, tmp_path, workers):
+    with pytest.raises(InvalidInput, match=f"workers: expected at least 1, got {workers}"):
+        augment(annotate((0, 0.05)), tmp_path / "d", workers=workers)
+
+
+def test_an_unknown_camera_is_refused_with_the_nearest_name(annotate, augment, tmp_path):
+    with pytest.raises(UnknownName, match="camera 'wirst': did you mean 'wrist'"):
+        augment(annotate((0, 0.05)), tmp_path / "d", AugmentConfig(camera="wirst"))
+
+
+@pytest.mark.parametrize("mistake", ["workers", "camera", "backend", "annotation"])
+def test_a_request_that_is_refused_replaces_nothing_even_if_it_may_overwrite(
+    annotate, peg_demonstration, make_peg_backend, peg_backend, interrupted, tmp_path, mistake
+):
+    out = shutil.copytree(interrupted, tmp_path / "d")
+    annotation, make, config, workers = annotate((0, 0.05)), make_peg_backend, CROWDED, 1
+    if mistake == "workers":
+        workers = 0
+    elif mistake == "camera":
+        config = dataclasses.replace(CROWDED, camera="wirst")
+    elif mistake == "backend":
+
+        def make():
+            return Arm(peg_backend.robot, peg_backend.scene)
+    else:
+        annotation = dataclasses.replace(annotation, demonstration_hash="0" * 64)
+    with pytest.raises(SartError, match="workers|wirst|use another backend|another demonstration"):
+        augment_demonstration(
+            peg_demonstration, annotation, make, out, config, workers, overwrite=True
+        )
+    for path in interrupted.rglob("*.*"):
+        assert (out / path.relative_to(interrupted)).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"n": 1}, InvalidInput, "n: expected at least 2"),
+        ({"seed": -1}, InvalidInput, "seed: expected a whole number >= 0"),
+        ({"duration": 0.0}, InvalidInput, "duration: expected a finite number > 0"),
+        ({"duration": np.nan}, InvalidInput, "duration: expected a finite number > 0"),
+        ({"strategy": "srat"}, UnknownName, "did you mean 'sart'"),
+    ],
+)
+def test_a_bad_setting_is_refused(changes, error, message):
+    with pytest.raises(error, match=message):
+        AugmentConfig(**changes)

@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from sart_toolkit.augment.strategies import (
+    LAWS,
+    STRATEGIES,
+    SamplingConfig,
+    get_strategy,
+    sample_direction,
+    sample_rotation,
+    sart,
+)
+from sart_toolkit.errors import InvalidInput, UnknownName
+from sart_toolkit.poses import angle_between, log_rotation, pose
+from sart_toolkit.records import Demonstration, PrecisionSphere, Steps, convergence_waypoint
+
+N = 20_000
+some = settings(max_examples=100, deadline=None, derandomize=True)
+
+
+def _fits(values, distribution):
+    return stats.kstest(values, distribution.cdf).pvalue > 0.01
+
+
+def _demonstration(positions):
+    """A demonstration whose tool goes through `positions (n, 3)`, its angle growing."""
+    n = len(positions)
+    Ts = np.stack([pose(p, [0, 0, 0.1 * i]) for i, p in enumerate(positions)])
+    steps = Steps(
+        joint_positions=np.zeros((n, 6)),
+        joint_velocities=np.zeros((n, 6)),
+        commanded_joint_positions=np.zeros((n, 6)),
+        measured_Ts_world_tool=Ts,
+        commanded_Ts_world_tool=Ts,
+        measured_gripper=np.zeros(n),
+        commanded_gripper=np.zeros(n),
+        contact_force=np.zeros(n),
+        cameras={},
+    )
+    return Demonstration(
+        task="none",
+        task_parameters={},
+        robot="none",
+        backend="none",
+        steps=steps,
+        timestamps=np.arange(n) / 10,
+        body_Ts_world={},
+        success=np.zeros(n, bool),
+        raw_commands=np.zeros((3 * n, 7)),
+        states=(),
+        operator="test",
+        device="none",
+        seconds=1.0,
+    )
+
+
+# --- sampling laws ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=LAWS)
+def law(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def directions(law):
+    rng = np.random.default_rng(0)
+    return np.array([sample_direction(rng, law) for _ in range(N)])
+
+
+def test_phi_is_uniform_by_the_paper_s_law_and_its_cosine_by_area(law, directions):
+    phi = np.arccos(np.clip(directions[:, 2], -1, 1))
+    assert _fits(phi, stats.uniform(0, np.pi)) == (law == "paper")
+    assert _fits(np.cos(phi), stats.uniform(-1, 2)) == (law == "area")
+
+
+def test_the_paper_s_law_draws_a_third_near_the_poles_and_area_an_eighth(law, directions):
+    near_pole = (np.abs(directions[:, 2]) > np.cos(np.deg2rad(30))).mean()
+    expected = {"paper": 1 / 3, "area": 1 - np.cos(np.deg2rad(30))}[law]
+    assert near_pole == pytest.approx(expected, abs=0.01)
+
+
+def test_psi_is_uniform_and_directions_are_unit_vectors(directions):
+    psi = np.arctan2(directions[:, 1], directions[:, 0])
+    assert _fits(psi, stats.uniform(-np.pi, 2 * np.pi))
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("largest", [0.02, 0.3, 2.5])
+def test_the_rotation_angle_is_uniform_and_its_axis_too(largest):
+    rng = np.random.default_rng(1)
+    vectors = np.array([log_rotation(sample_rotation(rng, largest)) for _ in range(N)])
+    angles = np.linalg.norm(vectors, axis=1)
+    assert angles.max() <= largest + 1e-12
+    # U[-largest, largest] about an axis is U[0, largest] about it or its opposite.
+    assert _fits(angles, stats.uniform(0, largest))
+    axes = vectors / angles[:, None]
+    for k in range(3):
+        assert _fits(axes[:, k], stats.uniform(-1, 2))
+    assert _fits(np.arctan2(axes[:, 1], axes[:, 0]), stats.uniform(-np.pi, 2 * np.pi))
+
+
+def test_no_rotation_is_drawn_where_none_is_allowed():
+    np.testing.assert_array_equal(sample_rotation(np.random.default_rng(0), 0.0), np.eye(3))
+
+
+# --- the strategy of the paper ------------------------------------------------------------------
+
+points = st.tuples(*[st.floats(-1, 1)] * 3)
+
+
+@some
+@given(
+    centre=points,
+    turn=points,
+    radius=st.floats(0.001, 0.5),
+    nu=st.floats(0, 3),
+    law=st.sampled_from(LAWS),
+    seed=st.integers(0, 2**32),
+)
+def test_the_sampled_pose_lies_on_the_sphere_turned_by_no_more_than_allowed(
+    centre, turn, radius, nu, law, seed
+):
+    demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
+    sphere = PrecisionSphere(0, pose(centre, turn), radius)
+    config = SamplingConfig(law, nu)
+    drawn = [sart(demonstration, sphere, np.random.default_rng(seed), config) for _ in range(2)]
+    T = drawn[0].T_world_sampled
+    np.testing.assert_array_equal(T, drawn[1].T_world_sampled)
+    assert np.linalg.norm(T[:3, 3] - sphere.T_world_key[:3, 3]) == pytest.approx(radius, abs=1e-12)
+    assert angle_between(sphere.T_world_key[:3, :3], T[:3, :3]) <= nu * radius + 1e-9
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_the_rotation_is_drawn_for_the_radius_of_the_sphere():
+    demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
+    rng = np.random.default_rng(2)
+    for radius in (0.05, 0.2):
+        sphere = PrecisionSphere(0, pose(), radius)
+        angles = [
+            angle_between(
+                np.eye(3),
+                sart(demonstration, sphere, rng, SamplingConfig()).T_world_sampled[:3, :3],
+            )
+            for _ in range(3000)
+        ]
+        assert _fits(angles, stats.uniform(0, 2.0 * radius))
+
+
+@some
+@given(
+    st.lists(points, min_size=2, max_size=12),
+    st.floats(0.01, 2.5),
+    st.data(),
+)
+def test_t_star_is_the_first_waypoint_after_the_key_outside_its_sphere(path, radius, data):
+    waypoint = data.draw(st.integers(0, len(path) - 2))
+    demonstration = _demonstration(path)
+    sphere = PrecisionSphere(waypoint, pose(path[waypoint]), radius)
+    expected = len(path) - 1
+    for t in reversed(range(waypoint + 1, len(path))):
+        if np.linalg.norm(np.subtract(path[t], path[waypoint])) > radius:
+            expected = t
+    assert convergence_waypoint(demonstration, sphere) == expected
+    proposal = sart(demonstration, sphere, np.random.default_rng(0), SamplingConfig())
+    assert proposal.t_star == expected
+
+
+def test_a_demonstration_that_never_leaves_a_sphere_is_joined_at_its_last_waypoint():
+    demonstration = _demonstration([[0, 0, 0.001 * t] for t in range(8)])
+    assert convergence_waypoint(demonstration, PrecisionSphere(2, pose(), 0.1)) == 7
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_every_strategy_rejoins_ahead_of_its_sphere_and_follows_from_the_rng(
+    name, peg_demonstration, peg_annotation
+):
+    strategy = get_strategy(name)
+    for sphere in peg_annotation.spheres:
+        drawn = [
+            strategy(peg_demonstration, sphere, np.random.default_rng(3), SamplingConfig())
+            for _ in range(2)
+        ]
+        assert sphere.waypoint < drawn[0].t_star < len(peg_demonstration)
+        np.testing.assert_array_equal(drawn[0].T_world_sampled, drawn[1].T_world_sampled)
+        with pytest.raises(ValueError, match="read-only"):
+            drawn[0].T_world_sampled[0, 0] = 1.0
+
+
+# --- errors -------------------------------------------------------------------------------------
+
+
+def test_an_unknown_strategy_is_refused_with_the_nearest_name():
+    with pytest.raises(UnknownName, match="unknown strategy 'srat': did you mean 'sart'"):
+        get_strategy("srat")
+
+
+def test_an_unknown_sampling_law_is_refused_with_the_nearest_name():
+    with pytest.raises(UnknownName, match="unknown sampling law 'papers': did you mean 'paper'"):
+        SamplingConfig(law="papers")
+
+
+@pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
+def test_a_rotation_per_metre_that_is_no_angle_is_refused(value):
+    with pytest.raises(InvalidInput, match="rotation_per_metre: expected a finite number >= 0"):
+        SamplingConfig(rotation_per_metre=value)
+    assert dataclasses.replace(SamplingConfig(), rotation_per_metre=0.0).rotation_per_metre == 0

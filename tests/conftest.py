@@ -1,0 +1,81 @@
+"""One recorded peg-in-hole demonstration, its annotation and a small dataset, shared by all."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
+from sart_toolkit.backends import make_backend
+from sart_toolkit.backends.interface import Backend
+from sart_toolkit.records import Annotation, Dataset, Demonstration
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.teach.scripted import ScriptedOperator
+from sart_toolkit.teach.session import record_demonstration
+from sart_toolkit.teach.suggest import suggest_annotation
+
+PICTURE_SIZE = 48
+
+
+@pytest.fixture(scope="session")
+def peg_task() -> Task:
+    return get_task("peg_in_hole")
+
+
+@pytest.fixture(scope="session")
+def make_peg_backend(peg_task: Task) -> Callable[[], Backend]:
+    """Makes the robot in the peg-in-hole scene; picklable."""
+    robot = get_robot(peg_task.robot)
+    return functools.partial(make_backend, "pybullet", robot, peg_task.scene, PICTURE_SIZE)
+
+
+@pytest.fixture(scope="session")
+def peg_model(peg_task: Task) -> RobotModel:
+    return RobotModel(get_robot(peg_task.robot), peg_task.scene.held)
+
+
+@pytest.fixture(scope="session")
+def peg_backend(make_peg_backend: Callable[[], Backend]) -> Iterator[Backend]:
+    """A backend for tests that begin with a reset or a restore."""
+    backend = make_peg_backend()
+    yield backend
+    backend.close()
+
+
+@pytest.fixture(scope="session")
+def peg_demonstration(
+    peg_task: Task, peg_model: RobotModel, make_peg_backend: Callable[[], Backend]
+) -> Demonstration:
+    """The scripted operator's demonstration with seed 0, the hole in the middle."""
+    backend = make_peg_backend()
+    stages = peg_task.plan(peg_task.initial_state(peg_model, Placement()))
+    operator = ScriptedOperator(stages, np.random.default_rng(0))
+    demonstration = record_demonstration(backend, peg_task, peg_model, operator, seed=0)
+    backend.close()
+    return demonstration
+
+
+@pytest.fixture(scope="session")
+def peg_annotation(peg_task: Task, peg_demonstration: Demonstration) -> Annotation:
+    """The spheres suggested for `peg_demonstration`."""
+    return suggest_annotation(peg_demonstration, get_robot(peg_task.robot), peg_task.scene)
+
+
+@pytest.fixture(scope="session")
+def peg_dataset(
+    peg_demonstration: Demonstration,
+    peg_annotation: Annotation,
+    make_peg_backend: Callable[[], Backend],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Dataset:
+    """Five trajectories: the demonstration and four generated ones."""
+    out = tmp_path_factory.mktemp("peg") / "dataset"
+    return augment_demonstration(
+        peg_demonstration, peg_annotation, make_peg_backend, out, AugmentConfig(n=5)
+    )

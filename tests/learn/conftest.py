@@ -1,0 +1,158 @@
+"""Small synthetic datasets: a bright blob whose place in the picture decides the action."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sart_toolkit.learn.training import TrainConfig
+from sart_toolkit.poses import pose
+from sart_toolkit.records import (
+    Annotation,
+    CameraRecord,
+    Dataset,
+    Demonstration,
+    Episode,
+    PrecisionSphere,
+    Provenance,
+    Steps,
+)
+
+# Blob at (u, v) in [-1, 1]: the next command moves by this much of it [m].
+GAIN = 0.01
+
+
+def blob_picture(u: float, v: float, rng: np.random.Generator, size: int) -> np.ndarray:
+    at = np.linspace(-1, 1, size)
+    blob = np.exp(-((at[None, :] - u) ** 2 + (at[:, None] - v) ** 2) / 0.08)
+    picture = 60 + 150 * blob[..., None] * [1.0, 0.6, 0.3] + rng.normal(0, 3, (size, size, 3))
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def make_steps(
+    n: int, rng: np.random.Generator, T_world_next: np.ndarray | None = None, size: int = 32
+) -> Steps:
+    """Steps whose action t is GAIN * (u, v) of picture t, the last leading to `T_world_next`."""
+    places = rng.uniform(-0.8, 0.8, (n, 2))
+    commanded = np.tile(pose((0.4, 0.0, 0.3)), (n + 1, 1, 1))
+    commanded[1:, :2, 3] += GAIN * np.cumsum(places, 0)
+    if T_world_next is not None:
+        commanded[:, :3, 3] += T_world_next[:3, 3] - commanded[-1, :3, 3]
+    commanded = commanded[:-1]
+    gripper = rng.uniform(0, 1, n)
+    return Steps(
+        joint_positions=rng.normal(size=(n, 6)),
+        joint_velocities=rng.normal(size=(n, 6)),
+        commanded_joint_positions=rng.normal(size=(n, 6)),
+        measured_Ts_world_tool=commanded,
+        commanded_Ts_world_tool=commanded,
+        measured_gripper=gripper,
+        commanded_gripper=np.round(gripper),
+        contact_force=np.zeros(n),
+        cameras={
+            "wrist": CameraRecord(
+                rgb=np.stack([blob_picture(u, v, rng, size) for u, v in places]),
+                depth=np.zeros((n, size, size), np.float32),
+                intrinsics=np.diag([size, size, 1.0]),
+                T_tool_camera=pose((0.05, 0.0, -0.1)),
+            )
+        },
+    )
+
+
+def make_dataset(
+    t_stars: tuple[int, ...] = (3, 5, 5), n: int = 9, segment: int = 4, seed: int = 0
+) -> Dataset:
+    """A demonstration of `n` steps and an episode that rejoins it at each of `t_stars`."""
+    rng = np.random.default_rng(seed)
+    demonstration = Demonstration(
+        task="blob",
+        task_parameters={"gain": GAIN},
+        robot="none",
+        backend="synthetic",
+        steps=make_steps(n, rng),
+        timestamps=np.arange(n) / 10,
+        body_Ts_world={},
+        success=np.zeros(n, bool),
+        raw_commands=np.zeros((3 * n, 7)),
+        states=(),
+        operator="test",
+        device="none",
+        seconds=1.0,
+    )
+    key = demonstration.steps.measured_Ts_world_tool[0]
+    annotation = Annotation((PrecisionSphere(0, key, 0.05),), demonstration.content_hash())
+    episodes = tuple(
+        Episode(
+            make_steps(segment, rng, demonstration.steps.commanded_Ts_world_tool[t_star]),
+            Provenance(demonstration.content_hash(), 0, k, t_star, key, seed, "sart", "paper"),
+        )
+        for k, t_star in enumerate(t_stars)
+    )
+    return Dataset(demonstration, annotation, episodes)
+
+
+def perturbed(steps: Steps) -> Steps:
+    """The same steps with everything changed that a policy must not see."""
+    return dataclasses.replace(
+        steps,
+        joint_positions=steps.joint_positions + 1.0,
+        joint_velocities=-steps.joint_velocities,
+        commanded_joint_positions=steps.commanded_joint_positions - 2.0,
+        measured_Ts_world_tool=pose((5, 5, 5), (0, 0, 1)) @ steps.measured_Ts_world_tool,
+        contact_force=steps.contact_force + 7.0,
+    )
+
+
+def with_steps(dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
+    """The dataset with all steps changed, and hashes that match again."""
+    demonstration = dataclasses.replace(
+        dataset.demonstration, steps=change(dataset.demonstration.steps)
+    )
+    sha = demonstration.content_hash()
+    episodes = tuple(
+        Episode(
+            change(episode.steps),
+            dataclasses.replace(episode.provenance, demonstration_hash=sha),
+        )
+        for episode in dataset.episodes
+    )
+    return Dataset(demonstration, dataset.annotation, episodes)
+
+
+@pytest.fixture(name="make_dataset")
+def _make_dataset() -> Callable[..., Dataset]:
+    return make_dataset
+
+
+@pytest.fixture(name="perturbed")
+def _perturbed() -> Callable[[Steps], Steps]:
+    return perturbed
+
+
+@pytest.fixture(name="with_steps")
+def _with_steps() -> Callable[[Dataset, Callable[[Steps], Steps]], Dataset]:
+    return with_steps
+
+
+@pytest.fixture
+def dataset() -> Dataset:
+    return make_dataset()
+
+
+@pytest.fixture
+def small_config() -> TrainConfig:
+    """A training that takes a fraction of a second."""
+    return TrainConfig.for_policy(
+        "compact_mlp",
+        epochs=3,
+        batch_size=8,
+        image_size=16,
+        image_shift=1,
+        hidden=16,
+        device="cpu",
+        threads=1,
+    )

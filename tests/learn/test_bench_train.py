@@ -1,0 +1,47 @@
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+_PATH = Path(__file__).parents[2] / "tools" / "bench.py"
+_SPEC = importlib.util.spec_from_file_location("bench", _PATH)
+assert _SPEC is not None and _SPEC.loader is not None
+bench = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(bench)
+
+
+@pytest.fixture(autouse=True)
+def _threads_put_back():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_the_training_benchmark_ends_with_one_json_object(capsys):
+    arguments = "train --policy compact_mlp --repeats 2 --seconds 0.05 --image-size 16 --threads 1"
+    assert bench.main(arguments.split()) == 0
+    out, err = capsys.readouterr()
+    report = json.loads(out.splitlines()[-1])
+    figures = report["figures"]["compact_mlp"]
+    assert figures["loop_images_per_second"] > 0 and figures["bare_images_per_second"] > 0
+    low, high = figures["loop_over_bare_range"]
+    assert low <= figures["loop_over_bare"] <= high
+    assert report["machine"]["cores"] >= 1 and "torch" in report["versions"]
+    assert "compact_mlp turn 2/2" in err and len(out.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["trian"], "unknown benchmark 'trian': did you mean 'train'"),
+        (["train", "--policy", "compact"], "unknown policy 'compact': did you mean 'compact_mlp'"),
+        (["train", "--repeats", "0"], "--repeats: expected a finite number > 0"),
+        (["train", "--seconds", "nan"], "--seconds: expected a finite number > 0"),
+    ],
+)
+def test_bad_arguments_are_one_line_and_exit_code_2(capsys, arguments, message):
+    assert bench.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert not out and message in err and len(err.splitlines()) == 1

@@ -1,0 +1,186 @@
+import dataclasses
+import inspect
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from sart_toolkit import storage
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, OutputExists
+from sart_toolkit.learn.skill import Skill, SkillConfig, load_skill, save_skill
+from sart_toolkit.learn.training import CHECKPOINT, train
+from sart_toolkit.learn.windows import build_windows
+
+
+@pytest.fixture
+def trained(dataset, small_config, tmp_path):
+    result = train(dataset, small_config, tmp_path / "skill")
+    save_skill(tmp_path / "skill", result, dataset)
+    return tmp_path / "skill", result
+
+
+def _edit(path, **changes):
+    value = json.loads(path.read_text())
+    value.update(changes)
+    path.write_text(json.dumps({k: v for k, v in value.items() if v is not None}))
+
+
+def test_a_skill_is_the_files_of_the_design(trained):
+    path, result = trained
+    assert sorted(p.name for p in path.iterdir()) == [
+        "annotation.json",
+        "config.json",
+        "demo.h5",
+        "model.safetensors",
+        "training.json",
+    ]
+    training = storage.read_json(path / "training.json")
+    assert [record["epoch"] for record in training["curve"]] == [1, 2, 3]
+    assert training["final_loss"] == result.final_loss
+    assert training["images_per_second"] > 0 and training["seconds"] > 0
+    assert training["versions"]["torch"] == torch.__version__
+    assert training["config"] == result.config.to_json()
+    assert (training["windows"], training["trajectories"]) == (35, 4)
+
+
+def test_a_skill_acts_as_the_policy_did_in_training(trained, dataset):
+    path, result = trained
+    skill = load_skill(path)
+    windows = build_windows(dataset, "wrist", 16, 2)
+    steps = dataset.demonstration.steps
+    for _ in range(2):
+        skill.reset()
+        for t in range(len(steps)):
+            at = windows.history.tolist().index([max(0, t - 1), t])
+            frames, gripper, _ = windows.batch(torch.tensor([at]))
+            with torch.inference_mode():
+                expected = result.policy(frames, gripper)[0].numpy()
+            action = skill.act(steps.cameras["wrist"].rgb[t], float(steps.measured_gripper[t]))
+            assert action.shape == (7,) and action.dtype == np.float64
+            assert np.allclose(action, expected, atol=1e-7)
+
+
+def test_a_skill_sees_pictures_and_gripper_and_nothing_else():
+    assert list(inspect.signature(Skill.act).parameters) == ["self", "rgb", "gripper"]
+
+
+def test_a_skill_takes_pictures_of_any_size(trained):
+    skill = load_skill(trained[0])
+    rgb = np.full((32, 32, 3), 90, np.uint8)
+    first = skill.act(rgb, 0.5)
+    skill.reset()
+    assert np.allclose(skill.act(np.full((48, 20, 3), 90, np.uint8), 0.5), first)
+
+
+def test_a_skill_says_where_it_came_from(trained, dataset):
+    skill = load_skill(trained[0])
+    assert skill.demonstration.content_hash() == dataset.demonstration.content_hash()
+    assert skill.annotation.demonstration_hash == dataset.annotation.demonstration_hash
+    config = skill.config
+    assert (config.task, config.robot, config.backend) == ("blob", "none", "synthetic")
+    assert (config.camera, config.recorded_size) == ("wrist", (32, 32))
+    assert np.allclose(config.T_tool_camera[:3, 3], [0.05, 0, -0.1])
+    assert dict(config.task_parameters) == {"gain": 0.01}
+    assert SkillConfig.from_json(config.to_json()).to_json() == config.to_json()
+
+
+@pytest.mark.parametrize(
+    "rgb",
+    [
+        np.zeros((8, 8, 3)),
+        np.zeros((8, 8), np.uint8),
+        np.zeros((8, 8, 4), np.uint8),
+        np.zeros((0, 8, 3), np.uint8),
+    ],
+)
+def test_anything_but_a_picture_is_refused(trained, rgb):
+    with pytest.raises(InvalidInput, match=r"rgb: expected uint8 of shape \(H, W, 3\), got"):
+        load_skill(trained[0]).act(rgb, 0.0)
+
+
+def test_a_gripper_that_is_not_a_number_is_refused(trained):
+    with pytest.raises(InvalidInput, match=r"gripper: expected a number in \[0, 1\], got nan"):
+        load_skill(trained[0]).act(np.zeros((8, 8, 3), np.uint8), float("nan"))
+
+
+def test_a_skill_is_not_overwritten_unless_asked(trained, dataset):
+    path, result = trained
+    with pytest.raises(OutputExists, match="config.json: already exists"):
+        save_skill(path, result, dataset)
+    save_skill(path, result, dataset, overwrite=True)
+    load_skill(path)
+
+
+def test_saving_a_skill_ends_its_checkpoint(dataset, small_config, tmp_path):
+    result = train(dataset, small_config, tmp_path)
+    assert (tmp_path / CHECKPOINT).exists()
+    save_skill(tmp_path, result, dataset)
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
+def test_a_missing_directory_is_refused(tmp_path):
+    with pytest.raises(MissingFile, match="no such skill directory; make it with `sart train`"):
+        load_skill(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    "name", ["config.json", "training.json", "demo.h5", "annotation.json", "model.safetensors"]
+)
+def test_a_skill_that_lacks_a_file_is_refused(trained, name):
+    (trained[0] / name).unlink()
+    with pytest.raises(MissingFile, match=name):
+        load_skill(trained[0])
+
+
+@pytest.mark.parametrize(
+    "name", ["config.json", "training.json", "demo.h5", "annotation.json", "model.safetensors"]
+)
+def test_a_truncated_file_is_refused(trained, name):
+    path = trained[0] / name
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(BrokenFile, match=name):
+        load_skill(trained[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"robot": None}, "skill configuration: 'robot' is missing"),
+        ({"colour": "red"}, "skill configuration: 'colour' is unknown"),
+        ({"recorded_size": [0, 5]}, "recorded_size: expected"),
+        ({"intrinsics": [[1]]}, "intrinsics: expected shape"),
+        ({"training": {"policy": "compact_mpl"}}, "training options: 'epochs' is missing"),
+        ({"training": 3}, "config.json"),
+    ],
+)
+def test_a_configuration_that_makes_no_sense_is_refused(trained, change, message):
+    _edit(trained[0] / "config.json", **change)
+    with pytest.raises(BrokenFile, match=message):
+        load_skill(trained[0])
+
+
+def test_a_configuration_is_checked_when_made(trained):
+    config = load_skill(trained[0]).config
+    with pytest.raises(InvalidInput, match=r"recorded_size: expected \(height, width\)"):
+        dataclasses.replace(config, recorded_size=(32,))
+    with pytest.raises(InvalidInput, match="T_tool_camera: not a rigid transform"):
+        dataclasses.replace(config, T_tool_camera=2 * np.eye(4))
+
+
+@pytest.mark.parametrize("name", ["demo.h5", "annotation.json", "model.safetensors"])
+def test_files_of_different_skills_are_refused(trained, make_dataset, small_config, tmp_path, name):
+    other = make_dataset(seed=7)
+    save_skill(tmp_path / "other", train(other, small_config, tmp_path / "other"), other)
+    shutil.copy(tmp_path / "other" / name, trained[0] / name)
+    with pytest.raises(Mismatch, match=f"{name}: belongs to another demonstration"):
+        load_skill(trained[0])
+
+
+def test_weights_of_another_policy_are_refused(trained, dataset, small_config, tmp_path):
+    wide = dataclasses.replace(small_config, hidden=24)
+    save_skill(tmp_path / "wide", train(dataset, wide, tmp_path / "wide"), dataset)
+    shutil.copy(tmp_path / "wide" / "model.safetensors", trained[0] / "model.safetensors")
+    with pytest.raises(Mismatch, match="does not fit the policy in config.json"):
+        load_skill(trained[0])

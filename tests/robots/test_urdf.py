@@ -1,0 +1,318 @@
+"""The composed URDF: one small self-contained file, its solids enclose the source's, made once."""
+
+from __future__ import annotations
+
+import os
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+
+import numpy as np
+import pytest
+import trimesh
+
+from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, MissingExtra, MissingFile
+from sart_toolkit.poses import pose, rpy_pose
+from sart_toolkit.robots import urdf as urdf_module
+from sart_toolkit.robots.spec import Attachment, Shape, resource_path
+from sart_toolkit.robots.urdf import cache_dir, composed_urdf
+
+BOX = (Shape("box", (0.02, 0.02, 0.02)),)
+
+
+@pytest.fixture(scope="session")
+def fresh_urdf(spec, tmp_path_factory):
+    """The UR5e's composed URDF, made now."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SART_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield composed_urdf(spec)
+
+
+@pytest.fixture(scope="session")
+def robot(fresh_urdf):
+    return ET.parse(fresh_urdf).getroot()
+
+
+def source_robots(spec):
+    """(name prefix, folder, parsed URDF) of the arm's and the gripper's sources."""
+    for prefix, resource in (("", spec.urdf), ("gripper_", spec.gripper.urdf)):
+        path = resource_path(resource)
+        # The sources use the prefix drake: without declaring it.
+        yield prefix, path.parent, ET.fromstring(path.read_text().replace("drake:", "drake_"))
+
+
+def meshes(link, kind, folder):
+    """The link's meshes of a kind, scaled, None for other geometry."""
+    found = []
+    for element in link.findall(kind):
+        mesh = element.find("geometry/mesh")
+        if mesh is None:
+            found.append(None)
+            continue
+        loaded = trimesh.load(folder / mesh.get("filename"), force="mesh")
+        loaded.apply_scale([float(s) for s in mesh.get("scale", "1 1 1").split()])
+        found.append(loaded)
+    return found
+
+
+def place(element):
+    origin = element.find("origin")
+    attributes = {} if origin is None else origin.attrib
+    p, rpy = ([float(x) for x in attributes.get(k, "0 0 0").split()] for k in ("xyz", "rpy"))
+    return rpy_pose(p, rpy)
+
+
+def farthest_outside(mesh, points):
+    """How far [m] the farthest point lies outside a convex mesh's face planes (< 0: all inside)."""
+    normals = mesh.face_normals
+    offsets = np.einsum("ij,ij->i", normals, mesh.triangles[:, 0])
+    return float((points @ normals.T - offsets).max())
+
+
+def test_links_and_joints_have_unique_names(robot):
+    for kind in ("link", "joint"):
+        counts = Counter(element.get("name") for element in robot.findall(kind))
+        assert [name for name, count in counts.items() if count > 1] == []
+
+
+def test_links_form_one_tree_with_the_arms_base_as_its_root(robot):
+    links = {link.get("name") for link in robot.findall("link")}
+    children = [joint.find("child").get("link") for joint in robot.findall("joint")]
+    parents = {joint.find("parent").get("link") for joint in robot.findall("joint")}
+    assert max(Counter(children).values()) == 1
+    assert parents <= links
+    assert links - set(children) == {"base_link"}
+    assert {"tool", "tool0", "wrist_camera", "gripper_base_link"} <= links
+
+
+def test_no_extension_of_a_vendor_and_no_mimic_is_left(fresh_urdf, robot):
+    assert re.findall(r"drake\S*|<mimic", fresh_urdf.read_text()) == []
+    assert {element.tag for element in robot} == {"link", "joint"}
+
+
+def test_every_link_has_an_inertia_that_a_body_can_have(robot):
+    for link in robot.findall("link"):
+        inertial = link.find("inertial")
+        assert float(inertial.find("mass").get("value")) > 0
+        xx, xy, xz, yy, yz, zz = (
+            float(inertial.find("inertia").get(k)) for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        least, middle, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        assert 0 < least
+        assert most <= (least + middle) * (1 + 1e-6), link.get("name")
+
+
+def test_every_mesh_lies_beside_the_urdf(fresh_urdf, robot):
+    names = [mesh.get("filename") for mesh in robot.iter("mesh")]
+    assert names
+    for name in names:
+        assert (fresh_urdf.parent / name).is_file()
+        assert os.path.basename(name) == name
+
+
+def test_collision_parts_are_convex_and_enclose_the_source_meshes(spec, fresh_urdf, robot):
+    links = {link.get("name"): link for link in robot.findall("link")}
+    checked = 0
+    for prefix, folder, source in source_robots(spec):
+        for link in source.findall("link"):
+            composed = links[prefix + link.get("name")]
+            ours = meshes(composed, "collision", fresh_urdf.parent)
+            theirs = meshes(link, "collision", folder)
+            assert len(ours) == len(theirs)
+            for part, original in zip(ours, theirs, strict=True):
+                if original is None:
+                    assert part is None
+                    continue
+                assert farthest_outside(part, part.vertices) < 1e-6
+                assert farthest_outside(part, original.vertices[::3]) < 1e-6
+                # Not larger than it must be either.
+                np.testing.assert_allclose(part.bounds, original.bounds, atol=1e-6)
+                checked += 1
+    assert checked > 10
+
+
+def test_visual_and_collision_geometry_stays_where_the_source_has_it(spec, robot):
+    links = {link.get("name"): link for link in robot.findall("link")}
+    for prefix, _, source in source_robots(spec):
+        for link in source.findall("link"):
+            for kind in ("visual", "collision"):
+                pairs = zip(
+                    links[prefix + link.get("name")].findall(kind), link.findall(kind), strict=True
+                )
+                for ours, theirs in pairs:
+                    np.testing.assert_allclose(place(ours), place(theirs), atol=1e-12)
+
+
+def test_visual_meshes_are_light_and_look_like_the_source(spec, fresh_urdf, robot):
+    links = {link.get("name"): link for link in robot.findall("link")}
+    faces = []
+    for prefix, folder, source in source_robots(spec):
+        for link in source.findall("link"):
+            ours = meshes(links[prefix + link.get("name")], "visual", fresh_urdf.parent)
+            theirs = meshes(link, "visual", folder)
+            for part, original in zip(ours, theirs, strict=True):
+                if original is None:
+                    continue
+                faces.append(len(part.faces))
+                # No corner sticks out of the source; what the wrist camera sees fills it too.
+                (low, high), (source_low, source_high) = part.bounds, original.bounds
+                name = prefix + link.get("name")
+                assert (low >= source_low - 0.002).all(), (name, low - source_low)
+                assert (high <= source_high + 0.002).all(), (name, high - source_high)
+                if prefix:
+                    np.testing.assert_allclose(part.bounds, original.bounds, atol=0.005)
+    assert max(faces) <= 600
+    assert sum(faces) <= 5000
+
+
+def test_every_visual_has_a_colour_and_materials_have_unique_names(robot):
+    materials = [visual.find("material") for visual in robot.iter("visual")]
+    assert all(material.find("color") is not None for material in materials)
+    names = [material.get("name") for material in materials]
+    assert len(set(names)) == len(names)
+
+
+def test_what_is_attached_has_its_place_its_shapes_and_its_mass(make_tiny):
+    T = pose([0.1, -0.2, 0.3], [0.4, 0.5, -0.6])
+    shapes = (
+        Shape("box", (0.1, 0.2, 0.3), pose([0.01, 0, 0])),
+        Shape("cylinder", (0.05, 0.4), collides=False),
+        Shape("sphere", (0.05,)),
+    )
+    held = Attachment("peg", "tool", shapes, T, mass=0.25)
+    robot = ET.parse(composed_urdf(make_tiny(), (held,))).getroot()
+    joint = next(j for j in robot.findall("joint") if j.find("child").get("link") == "peg")
+    assert joint.find("parent").get("link") == "tool"
+    np.testing.assert_allclose(place(joint), T, atol=1e-9)
+    link = next(link for link in robot.findall("link") if link.get("name") == "peg")
+    assert float(link.find("inertial/mass").get("value")) == 0.25
+    drawn = [next(iter(v.find("geometry"))).tag for v in link.findall("visual")]
+    solid = [next(iter(c.find("geometry"))).tag for c in link.findall("collision")]
+    assert drawn == ["box", "cylinder", "sphere"]
+    assert solid == ["box", "sphere"]
+    np.testing.assert_allclose(place(link.find("visual")), shapes[0].T_body_shape, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "rotvec", [(0, np.pi / 2, 0), (0, -np.pi / 2, 0), (np.pi, 0, 0), (0, 0, -3), (1, 2, -1)]
+)
+def test_an_attachment_may_be_turned_any_way(make_tiny, rotvec):
+    T = pose([0, 0, 0.1], rotvec)
+    robot = ET.parse(composed_urdf(make_tiny(), (Attachment("peg", "tool", BOX, T),))).getroot()
+    joint = next(j for j in robot.findall("joint") if j.find("child").get("link") == "peg")
+    np.testing.assert_allclose(place(joint), T, atol=1e-9)
+
+
+# --- the cache ----------------------------------------------------------------------------------
+
+
+def test_a_composed_urdf_is_made_once(make_tiny, monkeypatch):
+    spec = make_tiny()
+    first = composed_urdf(spec)
+    before = {p: p.stat().st_mtime_ns for p in first.parent.iterdir()}
+
+    def never(*_):
+        raise AssertionError("composed again")
+
+    monkeypatch.setattr(urdf_module, "_compose", never)
+    assert composed_urdf(spec) == composed_urdf(make_tiny()) == first
+    assert {p: p.stat().st_mtime_ns for p in first.parent.iterdir()} == before
+
+
+def test_another_robot_source_or_held_body_gets_another_urdf(make_tiny, tmp_path):
+    spec = make_tiny()
+    made = [
+        composed_urdf(spec),
+        composed_urdf(spec, (Attachment("peg", "tool", BOX),)),
+        composed_urdf(spec, (Attachment("peg", "tool", BOX, mass=0.2),)),
+        composed_urdf(make_tiny(T_gripper_tool=pose([0, 0, 0.2]))),
+    ]
+    arm = tmp_path / "arm.urdf"
+    arm.write_text(arm.read_text().replace("0.3", "0.25"))
+    made.append(composed_urdf(spec))
+    assert len(set(made)) == len(made)
+    assert all(path.is_file() for path in made)
+
+
+def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.setenv("SART_CACHE", str(tmp_path / "ours"))
+    assert cache_dir() == tmp_path / "ours" / "sart_toolkit"
+    monkeypatch.delenv("SART_CACHE")
+    assert cache_dir() == tmp_path / "xdg" / "sart_toolkit"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache_dir() == tmp_path / ".cache" / "sart_toolkit"
+
+
+def test_another_process_may_have_made_the_same_urdf_meanwhile(make_tiny, own_cache, monkeypatch):
+    replace = os.replace
+
+    def beaten(work, directory):
+        replace(work, directory)
+        raise OSError("Directory not empty")
+
+    monkeypatch.setattr(os, "replace", beaten)
+    path = composed_urdf(make_tiny())
+    assert path.is_file()
+    assert [p for p in (own_cache / "sart_toolkit").iterdir()] == [path.parent]
+
+
+@pytest.mark.parametrize("step", ["mkdir", "replace"])
+def test_a_cache_that_can_not_be_written_is_told_and_left_clean(
+    make_tiny, own_cache, monkeypatch, step
+):
+    if step == "mkdir":
+        own_cache.write_text("in the way")
+    else:
+
+        def full(*_):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(CannotWrite, match="SART_CACHE"):
+        composed_urdf(make_tiny())
+    if step == "replace":
+        assert list((own_cache / "sart_toolkit").iterdir()) == []
+
+
+# --- sources that can't be used -----------------------------------------------------------------
+
+
+def test_a_missing_source_is_told(make_tiny, tmp_path):
+    with pytest.raises(MissingFile, match="nowhere.urdf: no such file"):
+        composed_urdf(make_tiny(urdf=str(tmp_path / "nowhere.urdf")))
+    with pytest.raises(MissingExtra, match="pip install no_such_package"):
+        composed_urdf(make_tiny(gripper={"urdf": "no_such_package:hand.urdf"}))
+
+
+@pytest.mark.parametrize("content", [b"", b"<robot><link", b"no xml", b"\xff\xfe<robot/>"])
+def test_a_source_that_is_no_urdf_is_broken_and_leaves_no_files(
+    make_tiny, own_cache, tmp_path, content
+):
+    (tmp_path / "bad.urdf").write_bytes(content)
+    with pytest.raises(BrokenFile, match="bad.urdf: not a readable URDF"):
+        composed_urdf(make_tiny(urdf=str(tmp_path / "bad.urdf")))
+    assert list((own_cache / "sart_toolkit").iterdir()) == []
+
+
+def test_a_source_whose_mesh_is_missing_is_broken(make_tiny, own_cache, tmp_path):
+    arm = tmp_path / "arm.urdf"
+    arm.write_text(arm.read_text().replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="x.obj"/>'))
+    with pytest.raises(BrokenFile, match="mesh x.obj is missing; reinstall the package"):
+        composed_urdf(make_tiny())
+    assert list((own_cache / "sart_toolkit").iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["tool", "upper", "gripper_finger"])
+def test_a_held_body_with_the_name_of_a_link_is_refused(make_tiny, name):
+    with pytest.raises(InvalidInput, match=f"tiny: two links are called '{name}'; rename one"):
+        composed_urdf(make_tiny(), (Attachment(name, "tool", BOX),))
+
+
+def test_two_joints_of_one_name_are_refused(make_tiny):
+    held = Attachment("peg", "tool", BOX)
+    clash = Attachment("peg_fixed", "tool", BOX)
+    composed_urdf(make_tiny(), (held, clash))
+    with pytest.raises(InvalidInput, match="two links are called 'peg'"):
+        composed_urdf(make_tiny(), (held, held))
