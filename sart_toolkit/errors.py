@@ -39,7 +39,7 @@ class Unreachable(SartError, ValueError):
 
 
 class MotionRejected(SartError, RuntimeError):
-    """A motion can't be executed as asked: joint jump or limits."""
+    """A motion can't be executed as asked; the message's words before the colon say which way."""
 
 
 class MissingCapability(SartError, NotImplementedError):

@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "sart_toolkit"
 LAYERS = (
     "errors",
     "poses",
+    "tables",
     "workers",
     "records",
     "storage",

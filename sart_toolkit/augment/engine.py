@@ -151,7 +151,8 @@ def try_segment(
     except Unreachable:
         return Attempt("out of reach", None)
     except MotionRejected as error:
-        return Attempt(f"motion: {str(error).split(':')[0].split(';')[0]}", None)
+        # "joint jump: ..." or "joint limits: ...": the figures behind the colon differ each time.
+        return Attempt(str(error).partition(":")[0], None)
     provenance = Provenance(
         demonstration_hash=annotation.demonstration_hash,
         sphere=sphere_index,

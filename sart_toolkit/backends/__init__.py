@@ -5,12 +5,10 @@ A new backend is one file and one line in `BACKENDS`.
 
 from __future__ import annotations
 
-import importlib
-
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.errors import unknown_name
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.tables import lookup
 
 BACKENDS = {
     "pybullet": "sart_toolkit.backends.pybullet:PyBulletBackend",
@@ -29,9 +27,6 @@ def make_backend(name: str, robot: RobotSpec, scene: SceneSpec, image_size: int 
     Raises:
         UnknownName: no such backend; the message offers the nearest.
     """
-    if name not in BACKENDS:
-        raise unknown_name("backend", name, BACKENDS)
-    module, attribute = BACKENDS[name].split(":")
-    made = getattr(importlib.import_module(module), attribute)(robot, scene, image_size)
+    made = lookup("backend", name, BACKENDS)(robot, scene, image_size)
     assert isinstance(made, Backend)
     return made

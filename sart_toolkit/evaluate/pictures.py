@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 from PIL import Image as PillowImage
 from PIL import ImageDraw
@@ -34,6 +34,10 @@ SPHERE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e0
 _INK = {"light": "#1f2430", "dark": "#e7eaf0"}
 _FAINT = {"light": "#c9ced8", "dark": "#49505e"}
 _PAPER = {"light": "#ffffff", "dark": "#1b1f27"}
+_OUTCOMES: dict[Theme, dict[Outcome, str]] = {
+    "light": OUTCOME_COLOURS,
+    "dark": {"success": "#3ecf9f", "failure": "#ff9a57"},
+}
 _ACCENT = {"light": "#0063b1", "dark": "#6cb6ff"}
 
 
@@ -69,11 +73,11 @@ def film_strip(
         raise InvalidInput(f"size: expected at least 32 pixels, got {size}")
     rgb = cameras[camera].rgb
     chosen = np.linspace(0, len(rgb) - 1, min(n, len(rgb))).round().astype(int)
-    width, gap, footer = round(size * rgb.shape[2] / rgb.shape[1]), size // 30, size // 7
+    width, gap, footer = round(size * rgb.shape[2] / rgb.shape[1]), size // 30, size // 6
     strip = PillowImage.new(
         "RGB", (gap + len(chosen) * (width + gap), size + footer + gap), "#15181d"
     )
-    draw, text = ImageDraw.Draw(strip), font(max(9, footer // 2))
+    draw, text = ImageDraw.Draw(strip), font(max(9, round(0.6 * footer)))
     start = demonstration.timestamps[0]
     for i, t in enumerate(chosen):
         picture = PillowImage.fromarray(rgb[t])
@@ -320,7 +324,7 @@ def training_curve(
         raise InvalidInput("epochs: the training curve is empty; train for at least one epoch")
     if (y <= 0).any():
         raise InvalidInput(f"losses: a logarithmic scale needs values > 0, got {y.min():g}")
-    with _figure((8.0, 3.4), theme) as figure:
+    with _figure((7.0, 3.2), theme) as figure:
         axes = figure.add_subplot()
         marker = "o" if len(x) <= 15 else ""
         axes.semilogy(x, y, color=_ACCENT[theme], linewidth=2, marker=marker, markersize=4)
@@ -330,6 +334,11 @@ def training_curve(
         axes.set_xlabel("epoch")
         axes.set_ylabel("training loss")
         axes.xaxis.set_major_locator(MaxNLocator(9, integer=True))
+        decades = float(np.log10(y.max() / y.min()))
+        marks = (1,) if decades > 2.5 else (1, 2, 5) if decades > 0.7 else range(1, 10)
+        axes.yaxis.set_major_locator(LogLocator(subs=tuple(marks)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda loss, _: f"{loss:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
         axes.margins(x=0.03, y=0.12)
         _quiet(axes)
         figure.tight_layout()
@@ -401,9 +410,9 @@ def _draw_placements(
     markers: tuple[tuple[Outcome, str, int], ...] = (("success", "o", 34), ("failure", "X", 62))
     for outcome, marker, size in markers:
         x, y, yaw = np.array([row[:3] for row in rows if row[3] == outcome]).reshape(-1, 3).T
-        style: Any = {"color": OUTCOME_COLOURS[outcome], "linewidths": 0}
+        style: Any = {"color": _OUTCOMES[theme][outcome], "linewidths": 0}
         axes.scatter(
-            x, y, s=size, marker=marker, alpha=0.85, zorder=3, label=f"{outcome} ({len(x)})",
+            x, y, s=size, marker=marker, alpha=0.9, zorder=3, label=f"{outcome} ({len(x)})",
             **style,
         )  # fmt: skip
         if turned:

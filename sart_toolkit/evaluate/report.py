@@ -178,16 +178,17 @@ def _table(
             ),
         )
 
-    return element(
-        "div",
-        element(
-            "table",
-            element("thead", cells("th", head, scope="col")),
-            element("tbody", *(cells("td", row) for row in rows)),
-        ),
-        class_="scroll",
-        tabindex=0,
+    table = element(
+        "table",
+        element("thead", cells("th", head, scope="col")),
+        element("tbody", *(cells("td", row) for row in rows)),
     )
+    return _scrolling("scroll", f"table by {head[0]}", table)
+
+
+def _scrolling(kind: str, label: str, content: Markup) -> Markup:
+    """Content that scrolls sideways where the page is narrow, by keyboard as well."""
+    return element("div", content, class_=kind, role="region", aria_label=label, tabindex=0)
 
 
 def _section(title: str, *content: str) -> Markup:
@@ -214,23 +215,27 @@ def _badge(outcome: str) -> Markup:
 # --- numbers in words ---------------------------------------------------------------------------
 
 
+# No line may end between a number and its unit.
+_SPACE = "\N{NO-BREAK SPACE}"
+
+
 def duration(seconds: float) -> str:
     """A time span as a person would write it: `9.6 s`, `3 min 32 s`, `2 h 05 min`."""
     if seconds < 59.95:
-        return f"{seconds:.1f} s"
+        return f"{seconds:.1f}{_SPACE}s"
     minutes, rest = divmod(round(seconds), 60)
     if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
+        return f"{minutes}{_SPACE}min {rest:02d}{_SPACE}s"
+    return f"{minutes // 60}{_SPACE}h {minutes % 60:02d}{_SPACE}min"
 
 
 def percent(share: float) -> str:
     """A share of 1 in per cent, to a tenth where it has one."""
-    return f"{100 * share:.1f}".removesuffix(".0") + " %"
+    return f"{100 * share:.1f}".removesuffix(".0") + f"{_SPACE}%"
 
 
 def _millimetres(metres: float) -> str:
-    return f"{1e3 * metres:.1f} mm"
+    return f"{1e3 * metres:.1f}{_SPACE}mm"
 
 
 def _plural(n: int, one: str, many: str = "") -> str:
@@ -346,7 +351,7 @@ def _demonstration_section(run: _Run) -> Markup:
             f"What the {camera} camera saw, from the start to the end. These pictures and the "
             "gripper are all that the policy ever gets to see.",
         ),
-        element("div", _image(film_strip(d, camera, n), alt), class_="film", tabindex=0),
+        _scrolling("film", "film strip", _image(film_strip(d, camera, n), alt)),
     )
 
 
@@ -393,7 +398,7 @@ def _sphere_section(run: _Run) -> Markup:
             "the robot finds back to the demonstrated path: each coloured line is one such way, "
             "as measured while the robot moved.",
         ),
-        element("figure", _drawn(draw, alt)),
+        _scrolling("drawing", "3D views", _drawn(draw, alt)),
         _table(head, rows, numeric=(1, 2, 3, 4, 7)),
     )
 
@@ -439,6 +444,8 @@ def _training_section(run: _Run) -> Markup:
         return _absent(title, "No skill/training.json in this run: no policy was trained yet.")
     file = "training.json"
     curve = _field(run.training, file, "curve")
+    if not curve:
+        raise BrokenFile(f"{file}: its curve has no epoch; train the skill again")
     epochs = [float(_field(row, file, "epoch")) for row in curve]
     losses = [float(_field(row, file, "loss")) for row in curve]
     seconds = sum(float(_field(row, file, "seconds")) for row in curve)
@@ -448,19 +455,17 @@ def _training_section(run: _Run) -> Markup:
     def draw(theme: Theme) -> bytes:
         return training_curve(epochs, losses, theme)
 
-    figure = _drawn(
-        draw, f"Training loss over {len(curve)} epochs, on a logarithmic scale, ending at "
-        f"{losses[-1]:.2g}" if losses else "",
-    )  # fmt: skip
+    epochs_words = _plural(len(curve), "epoch")
+    alt = f"Training loss over {epochs_words}, on a logarithmic scale, ending at {losses[-1]:.2g}"
     return _section(
         title,
         element(
             "p",
             element("strong", str(policy)),
-            f" was trained for {_plural(len(curve), 'epoch')} in {duration(seconds)}"
+            f" was trained for {epochs_words} in {duration(seconds)}"
             + (f", {pace:,.0f} pictures each second." if pace else "."),
         ),
-        element("figure", figure),
+        _scrolling("drawing", "training curve", _drawn(draw, alt)),
     )
 
 
@@ -600,7 +605,7 @@ def _episode_section(run: _Run) -> Markup:
         rows.append(
             [
                 str(_field(e, file, "episode")),
-                ", ".join(map(str, seed)) if isinstance(seed, list) else str(seed),
+                f",{_SPACE}".join(map(str, seed)) if isinstance(seed, list) else str(seed),
                 _placement_words(e.get("placement") or {}),
                 _badge(str(_field(e, file, "outcome"))),
                 "yes" if e.get("success_any") else "no",
@@ -634,7 +639,10 @@ def _time_section(run: _Run) -> Markup:
         for name, seconds in stages.items()
     ]
     machine = run.run.get("machine") or {}
-    words = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in machine.items())
+    words = ", ".join(
+        f"memory {value} GiB" if key == "memory_gib" else f"{key.replace('_', ' ')} {value}"
+        for key, value in machine.items()
+    )
     return _section(
         title,
         element(
@@ -771,17 +779,20 @@ section > :last-child { margin-bottom: 0; }
 figure { margin: 0 0 1rem; }
 figcaption { color: var(--soft); font-size: .9rem; margin-top: .3rem; }
 img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
-.film { overflow-x: auto; border-radius: 6px; background: #15181d; }
+.film, .drawing { overflow-x: auto; }
+.film { border-radius: 6px; background: #15181d; }
 .film img { width: 100%; min-width: 820px; }
+.drawing img { min-width: 540px; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: .92rem;
   font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .38rem .9rem .38rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; }
-td { overflow-wrap: anywhere; min-width: 3.2rem; }
+td:last-child { overflow-wrap: anywhere; min-width: 3.2rem; }
 th { color: var(--soft); font-weight: 600; }
 tbody tr:last-child td { border-bottom: 0; }
 .number { text-align: right; white-space: nowrap; }
+.number:not(:last-child) { padding-right: 1.7rem; }
 .swatch { display: inline-block; width: .8em; height: .8em; border-radius: 50%;
   margin-right: .5em; }
 .bar { display: inline-block; width: clamp(60px, 24vw, 300px); height: .7em; border-radius: 4px;
@@ -822,18 +833,18 @@ details[open] summary { margin-bottom: .5rem; }
   section { padding: 1rem; }
   .interval { grid-template-columns: 1fr auto; gap: .2rem .8rem; }
   .interval .track { grid-column: 1 / -1; grid-row: 2; }
-  .scale { margin: 0 .6rem; }
+  .scale { margin: 0; }
   .scale span:first-child { transform: none; }
   .scale span:last-child { transform: translateX(-100%); }
 }
 @media print {
-  :root { --paper: #ffffff; }
-  body { font-size: 11px; -webkit-print-color-adjust: exact; print-color-adjust: exact; }
+  :root { --paper: #ffffff; font-size: 11px; }
+  body { font-size: 1rem; -webkit-print-color-adjust: exact; print-color-adjust: exact; }
   main { max-width: none; padding: 0; }
   section, .tile, figure, tr { break-inside: avoid; }
   section:has(details) { break-inside: auto; }
-  .scroll, .film { overflow: visible; }
-  .film img { min-width: 0; }
+  .scroll, .film, .drawing { overflow: visible; }
+  .film img, .drawing img { min-width: 0; }
   details::details-content { content-visibility: visible; block-size: auto; }
 }
 """

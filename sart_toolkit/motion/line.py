@@ -93,8 +93,8 @@ def straight_line(
     timing = _timed(limits)
     if timing.duration > duration + 1e-6:
         raise MotionRejected(
-            f"the line needs {timing.duration:.2f} s within the joints' limits, {duration:.2f} s "
-            "were given; allow more time or sample nearer"
+            f"joint limits: the line needs {timing.duration:.2f} s, {duration:.2f} s were given; "
+            "allow more time or sample nearer"
         )
     return StraightLine(start, end, duration, knots, timing)
 
@@ -117,11 +117,13 @@ def _path_limits(
     a = min(a, float(((spec.acceleration_limits - d2 * v**2) / (d1 + tiny)).min()))
     if a <= 0:
         raise MotionRejected(
-            "the line bends too sharply in joint space at its speed; allow more time"
+            "joint limits: the line bends too sharply at its speed; allow more time"
         )
     j = min(j, float(((spec.jerk_limits - 3 * d2 * v * a - d3 * v**3) / (d1 + tiny)).min()))
     if j <= 0:
-        raise MotionRejected("the line needs more jerk than the joints have; allow more time")
+        raise MotionRejected(
+            "joint limits: the line needs more jerk than they allow; allow more time"
+        )
     return v, a, j
 
 
@@ -133,5 +135,5 @@ def _timed(limits: tuple[float, float, float]) -> Trajectory:
     trajectory = Trajectory(1)
     result = Ruckig(1).calculate(request, trajectory)
     if result != Result.Working and result != Result.Finished:
-        raise MotionRejected(f"Ruckig found no timing ({result}); allow more time")
+        raise MotionRejected(f"joint limits: Ruckig found no timing ({result}); allow more time")
     return trajectory

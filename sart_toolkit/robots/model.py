@@ -144,7 +144,7 @@ class RobotModel:
         step = float(np.abs(q - start).max())
         if max_step is not None and step > max_step:
             raise MotionRejected(
-                f"joint step of {step:.2f} rad exceeds {max_step:.2f} rad: the pose lies on "
+                f"joint jump: a step of {step:.2f} rad exceeds {max_step:.2f} rad, the pose is on "
                 "another branch or too far; move in smaller steps"
             )
         return q

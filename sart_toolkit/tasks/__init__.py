@@ -5,9 +5,7 @@ A new task is one file and one line in `TASKS`.
 
 from __future__ import annotations
 
-import importlib
-
-from sart_toolkit.errors import unknown_name
+from sart_toolkit.tables import lookup
 from sart_toolkit.tasks.task import Task
 
 TASKS = {
@@ -21,9 +19,6 @@ def get_task(name: str) -> Task:
     Raises:
         UnknownName: no such task; the message offers the nearest.
     """
-    if name not in TASKS:
-        raise unknown_name("task", name, TASKS)
-    module, attribute = TASKS[name].split(":")
-    task = getattr(importlib.import_module(module), attribute)()
+    task = lookup("task", name, TASKS)()
     assert isinstance(task, Task)
     return task

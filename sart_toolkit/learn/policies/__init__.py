@@ -5,10 +5,8 @@ A new policy is one file with an `Encoder` and one line in `POLICIES`.
 
 from __future__ import annotations
 
-import importlib
-
-from sart_toolkit.errors import unknown_name
 from sart_toolkit.learn.policies.encoder import Encoder
+from sart_toolkit.tables import lookup
 
 POLICIES = {
     "compact_mlp": "sart_toolkit.learn.policies.compact_mlp:CompactEncoder",
@@ -22,9 +20,6 @@ def get_encoder(policy: str) -> type[Encoder]:
     Raises:
         UnknownName: no such policy; the message offers the nearest.
     """
-    if policy not in POLICIES:
-        raise unknown_name("policy", policy, POLICIES)
-    module, attribute = POLICIES[policy].split(":")
-    encoder = getattr(importlib.import_module(module), attribute)
+    encoder = lookup("policy", policy, POLICIES)
     assert issubclass(encoder, Encoder)
     return encoder
