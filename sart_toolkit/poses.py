@@ -6,6 +6,7 @@ vectors are axis times angle [rad]. Quaternions never appear here.
 
 from __future__ import annotations
 
+import numbers
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def check_pose(name: str, value: ArrayLike) -> Array:
     Raises:
         InvalidInput: wrong shape, not finite, or not a rigid transform.
     """
-    return check_poses(name, np.asarray(value)[None])[0]
+    return check_poses(name, _as_array(name, value)[None])[0]
 
 
 def check_poses(name: str, value: ArrayLike) -> Array:
@@ -58,15 +59,18 @@ def check_poses(name: str, value: ArrayLike) -> Array:
     Raises:
         InvalidInput: wrong shape, not finite, or not rigid transforms.
     """
-    array = np.asarray(value)
+    array = _as_array(name, value)
     if array.ndim != 3 or array.shape[1:] != (4, 4):
         got = array.shape[1:] if array.shape[:1] == (1,) else array.shape
         raise InvalidInput(f"{name}: expected pose shape (4, 4) or (n, 4, 4), got {got}")
     poses = check_array(name, array, (None, 4, 4))
     rotations = poses[:, :3, :3]
-    gram = rotations @ rotations.transpose(0, 2, 1)
     if (
-        (np.abs(gram - np.eye(3)) > _ORTHONORMAL_TOLERANCE).any()
+        # A rotation's entries are at most 1; larger ones might overflow in the product.
+        (np.abs(rotations) > 1 + _ORTHONORMAL_TOLERANCE).any()
+        or (
+            np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)) > _ORTHONORMAL_TOLERANCE
+        ).any()
         or (np.abs(poses[:, 3] - np.array([0, 0, 0, 1])) > 1e-12).any()
         or (np.linalg.det(rotations) < 0).any()
     ):
@@ -77,17 +81,25 @@ def check_poses(name: str, value: ArrayLike) -> Array:
     return poses
 
 
+def _as_array(name: str, value: ArrayLike) -> NDArray[Any]:
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise InvalidInput(f"{name}: expected an array, got rows of unequal length") from error
+
+
 def check_positive(name: str, value: float, unit: str = "") -> float:
     """`value` as a float greater than 0.
 
     Raises:
         InvalidInput: NaN, infinite, zero or negative.
     """
+    message = f"{name}: expected a finite number > 0{unit and ' ' + unit}, got {value!r}"
+    if not isinstance(value, numbers.Real):
+        raise InvalidInput(message)
     number = float(value)
     if not np.isfinite(number) or number <= 0:
-        raise InvalidInput(
-            f"{name}: expected a finite number > 0{unit and ' ' + unit}, got {value}"
-        )
+        raise InvalidInput(message)
     return number
 
 
@@ -144,8 +156,8 @@ def log_rotation(R: Array) -> Array:
         return v * (angle / sine)
     if cosine > 0:
         return v
-    # Near pi the antisymmetric part vanishes: R + I = 2 n n^T gives the axis.
-    S = 0.5 * (R + np.eye(3))
+    # Near pi the antisymmetric part vanishes: the symmetric part + I = 2 n n^T gives the axis.
+    S = 0.5 * (0.5 * (R + R.T) + np.eye(3))
     column = int(np.argmax(np.diag(S)))
     n = S[:, column] / np.sqrt(S[column, column])
     return angle * (n if v @ n >= 0 else -n)

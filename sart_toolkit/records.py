@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
+import numbers
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -77,7 +78,8 @@ def digest(parts: Mapping[str, Any]) -> str:
     sha = hashlib.sha256()
     for name in sorted(parts):
         value = parts[name]
-        sha.update(name.encode())
+        # As JSON, a name ends where its quotes end and can't run into the value.
+        sha.update(json.dumps(name).encode())
         if isinstance(value, np.ndarray):
             sha.update(f"{value.dtype.str}{value.shape}".encode())
             sha.update(np.ascontiguousarray(value).tobytes())
@@ -214,6 +216,11 @@ class Demonstration:
             raise InvalidInput(f"success: expected shape ({n},), got {success.shape}")
         object.__setattr__(self, "success", frozen(success))
         bodies = {k: frozen(check_poses(k, v)) for k, v in self.body_Ts_world.items()}
+        for name, Ts in bodies.items():
+            if len(Ts) != n:
+                raise InvalidInput(f"{name}: expected {n} poses, got {len(Ts)}")
+            if "/" in name or name in ("", "."):
+                raise InvalidInput(f"body {name!r}: a name has letters and no /; rename it")
         object.__setattr__(self, "body_Ts_world", bodies)
         if len(self.states) not in (0, n):
             raise InvalidInput(f"states: expected none or {n}, got {len(self.states)}")
@@ -260,15 +267,24 @@ class PrecisionSphere:
     limited_by: str | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.waypoint, bool) or int(self.waypoint) != self.waypoint:
-            raise InvalidInput(f"waypoint: expected a whole number, got {self.waypoint!r}")
+        number = self.waypoint
+        whole = isinstance(number, numbers.Real) and not isinstance(number, bool)
+        if not whole or not np.isfinite(number) or int(number) != number:
+            raise InvalidInput(f"waypoint: expected a whole number, got {number!r}")
+        object.__setattr__(self, "waypoint", int(number))
         if self.waypoint < 0:
             raise InvalidInput(f"waypoint: expected an index >= 0, got {self.waypoint}")
         if self.kind not in ("ball", "free_space"):
             raise InvalidInput(f"kind: expected 'ball' or 'free_space', got {self.kind!r}")
         if self.source not in ("human", "suggested"):
             raise InvalidInput(f"source: expected 'human' or 'suggested', got {self.source!r}")
-        check_positive(f"radius of the sphere at waypoint {self.waypoint}", self.radius, "m")
+        radius = f"radius of the sphere at waypoint {self.waypoint}"
+        object.__setattr__(self, "radius", check_positive(radius, self.radius, "m"))
+        if self.clearance is not None:
+            clearance = check_array("clearance", self.clearance, ())
+            object.__setattr__(self, "clearance", float(clearance))
+        if not isinstance(self.limited_by, str | None):
+            raise InvalidInput(f"limited_by: expected text, got {self.limited_by!r}")
         object.__setattr__(self, "T_world_key", frozen(check_pose("T_world_key", self.T_world_key)))
 
 
@@ -287,6 +303,14 @@ class Annotation:
     def __post_init__(self) -> None:
         if not self.spheres:
             raise InvalidInput("annotation: has no sphere; add at least one")
+        if not isinstance(self.demonstration_hash, str):
+            raise InvalidInput(
+                f"demonstration_hash: expected text, got {self.demonstration_hash!r}"
+            )
+        if not np.isfinite(self.seconds):
+            raise InvalidInput(f"seconds: expected a finite number, got {self.seconds}")
+        if not isinstance(self.settings, Mapping):
+            raise InvalidInput(f"settings: expected names and values, got {self.settings!r}")
         waypoints = [sphere.waypoint for sphere in self.spheres]
         if sorted(set(waypoints)) != waypoints:
             raise InvalidInput(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import json
 import os
 import shutil
@@ -23,6 +24,7 @@ from sart_toolkit.errors import (
     BrokenFile,
     CannotWrite,
     InvalidInput,
+    Mismatch,
     MissingFile,
     OutputExists,
     SartError,
@@ -93,7 +95,7 @@ def write_text(path: Path, text: str) -> None:
         CannotWrite: the disk refuses.
     """
     with replacing(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -119,8 +121,8 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     path = _existing(path)
     try:
-        value = json.loads(path.read_text())
-    except (ValueError, UnicodeDecodeError) as error:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
         raise BrokenFile(
             f"{path}: not readable as JSON ({error}); mend or make it again"
         ) from error
@@ -140,9 +142,9 @@ def check_writable(path: Path, overwrite: bool = False) -> None:
         CannotWrite: its nearest existing parent refuses new files.
     """
     path = Path(path)
-    if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
-        raise OutputExists(f"{path}: already exists; add --overwrite or choose another --out")
     with _cannot_write(path):
+        if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+            raise OutputExists(f"{path}: already exists; add --overwrite or choose another --out")
         parent = path if path.is_dir() else path.parent
         while not parent.exists():
             parent = parent.parent
@@ -180,6 +182,8 @@ def clear_directory(path: Path, mark: str, overwrite: bool) -> None:
     """
     path = Path(path)
     check_writable(path, overwrite)
+    if path.is_file():
+        raise OutputExists(f"{path}: is a file, so it won't be replaced; choose another --out")
     if path.is_dir() and any(path.iterdir()) and not (path / mark).exists():
         raise OutputExists(
             f"{path}: holds other things (no {mark}), so it won't be replaced; choose another --out"
@@ -189,7 +193,11 @@ def clear_directory(path: Path, mark: str, overwrite: bool) -> None:
 
 def _existing(path: Path) -> Path:
     path = Path(path)
-    if not path.exists():
+    try:
+        present = path.exists()
+    except OSError as error:
+        raise BrokenFile(f"{path}: {error.strerror}; check the path") from error
+    if not present:
         raise MissingFile(f"{path}: no such file; check the path, or make it first")
     if path.is_dir():
         raise BrokenFile(f"{path}: is a directory; expected a file")
@@ -215,11 +223,15 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
             found = file.attrs.get("kind")
             if found != kind:
                 raise BrokenFile(f"{path}: holds {found!r}, expected a {kind}; pass another file")
-            _check_schema(path, file.attrs.get("schema_version"))
+            version = file.attrs.get("schema_version")
+            _check_schema(path, version.item() if isinstance(version, np.generic) else version)
             yield file
+    except InvalidInput as error:
+        raise BrokenFile(f"{path}: {error}; restore a copy or make it again") from error
     except SartError:
         raise
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
+    # A damaged file may hold anything in place of a group, a number or JSON.
+    except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise BrokenFile(
             f"{path}: truncated or not a {kind} file ({error}); restore a copy or make it again"
         ) from error
@@ -227,10 +239,14 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
 
 @contextlib.contextmanager
 def _writing(path: Path, kind: str) -> Iterator[h5py.File]:
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    # In memory first: HDF5 crashes the process when a disk fills up under an open file.
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
         file.attrs["kind"] = kind
         file.attrs["schema_version"] = SCHEMA_VERSION
         yield file
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
 
 
 _STEP_ARRAYS = [f.name for f in dataclasses.fields(Steps) if f.name != "cameras"]
@@ -389,6 +405,11 @@ def annotation_from_json(value: Mapping[str, Any], path: Path) -> Annotation:
         InvalidInput: a value is out of range, such as a radius <= 0 or NaN.
     """
     try:
+        unknown = set(value) - {
+            "about", "demonstration_hash", "seconds_spent", "settings", "spheres"
+        }  # fmt: skip
+        if unknown:
+            raise BrokenFile(f"{path}: unknown field {sorted(unknown)[0]!r}; remove it")
         spheres = []
         for row in value["spheres"]:
             unknown = set(row) - {
@@ -455,7 +476,7 @@ def load_dataset(path: Path) -> Dataset:
         Mismatch: the annotation or an episode belongs to another demonstration.
     """
     path = Path(path)
-    if not path.is_dir():
+    if not os.path.isdir(path):
         raise MissingFile(f"{path}: no such dataset directory; make it with `sart augment`")
     if not (path / "dataset.json").exists() and (path / "attempts.jsonl").exists():
         raise BrokenFile(f"{path}: generation was interrupted; run `sart augment` again to resume")
@@ -463,11 +484,13 @@ def load_dataset(path: Path) -> Dataset:
     demonstration = load_demonstration(path / "demo.h5")
     annotation = load_annotation(path / "annotation.json")
     annotation.check_matches(demonstration)
-    try:
-        names = list(info["episodes"])
-    except KeyError as error:
-        raise BrokenFile(f"{path / 'dataset.json'}: lists no episodes; generate again") from error
+    names = info.get("episodes")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BrokenFile(f"{path / 'dataset.json'}: lists no episodes; generate again")
     episodes = tuple(load_episode(path / "episodes" / name) for name in names)
+    for name, episode in zip(names, episodes, strict=True):
+        if episode.provenance.demonstration_hash != annotation.demonstration_hash:
+            raise Mismatch(f"{path}: {name} belongs to another demonstration; generate it again")
     dataset = Dataset(demonstration, annotation, episodes, info)
     if info.get("content_hash") != dataset.content_hash():
         raise BrokenFile(f"{path}: content differs from its hash; generate it again")

@@ -89,9 +89,7 @@ def test_a_pose_holds_its_position_and_rotation(p, rotvec):
 @given(positions, st.tuples(*[st.floats(-np.pi, np.pi)] * 3))
 def test_rpy_turns_about_the_fixed_axes_in_turn(p, rpy):
     T = rpy_pose(p, rpy)
-    np.testing.assert_allclose(
-        T[:3, :3], Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-13
-    )
+    np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-13)
     np.testing.assert_array_equal(T[:3, 3], p)
 
 
@@ -149,9 +147,7 @@ def test_interpolated_positions_are_linear_and_rotations_geodesic(T_a, motion, s
     T_b = apply_motion(T_a, motion)
     T = check_pose("T", interpolate(T_a, T_b, s))
     np.testing.assert_allclose(T[:3, 3], T_a[:3, 3] + s * (T_b[:3, 3] - T_a[:3, 3]), atol=1e-12)
-    np.testing.assert_allclose(
-        T[:3, :3], T_a[:3, :3] @ exp_rotation(s * motion[3:]), atol=1e-9
-    )
+    np.testing.assert_allclose(T[:3, :3], T_a[:3, :3] @ exp_rotation(s * motion[3:]), atol=1e-9)
 
 
 def test_the_line_does_not_bend_as_a_screw_does():

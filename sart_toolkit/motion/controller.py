@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import (
     Array,
     angle_between,
@@ -52,13 +53,20 @@ class ToolController:
         self._T = model.fk(self._q)
 
     def reset(self, q_commanded: Array, T_world_tool_commanded: Array | None = None) -> None:
-        """Start from joint targets `(n,)`, at the commanded pose `(4, 4)` that they stand for."""
-        self._q = np.array(q_commanded, dtype=np.float64)
-        self._T = (
-            self.model.fk(self._q)
+        """Start from joint targets `(n,)`, at the commanded pose `(4, 4)` that they stand for.
+
+        Nothing changes if an error is raised.
+
+        Raises:
+            InvalidInput: not a joint configuration, or not a pose.
+        """
+        q = self.model.check_q(q_commanded)
+        T = (
+            self.model.fk(q)
             if T_world_tool_commanded is None
             else check_pose("T_world_tool_commanded", T_world_tool_commanded)
         )
+        self._q, self._T = q, T
 
     @property
     def commanded_T_world_tool(self) -> Array:
@@ -82,12 +90,15 @@ class ToolController:
             n: number of control periods.
 
         Raises:
-            InvalidInput: not a pose.
+            InvalidInput: not a pose, or `n` is not positive.
             Unreachable: no joint configuration within limits.
             MotionRejected: a joint would jump.
         """
+        if n < 1:
+            raise InvalidInput(f"n: expected at least 1 control period, got {n}")
         goal = self.clamped(
-            check_pose("desired_T_world_tool", desired_T_world_tool), measured_T_world_tool
+            check_pose("desired_T_world_tool", desired_T_world_tool),
+            check_pose("measured_T_world_tool", measured_T_world_tool),
         )
         targets = np.empty((n, len(self._q)))
         q = self._q

@@ -38,18 +38,25 @@ class RobotModel:
             spec: the robot.
             held: bodies fixed to its frames.
             gripper: gripper command in [0, 1] at which link poses are computed.
+
+        Raises:
+            InvalidInput: gripper command out of range, or joints in another order.
+            UnknownName: a joint or frame of `spec` or `held` isn't in the URDF.
         """
+        if not 0.0 <= gripper <= 1.0:
+            raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {gripper}")
         self.spec = spec
         self.held = tuple(held)
         self.gripper = float(gripper)
         self.urdf = composed_urdf(spec, held)
         full = pin.buildModelFromUrdf(str(self.urdf))
-        reference = pin.neutral(full)
-        for name, angle in spec.gripper.joint_angles(gripper).items():
-            reference[full.joints[full.getJointId(name)].idx_q] = angle
-        missing = [name for name in spec.arm_joints if not full.existJointName(name)]
+        angles = spec.gripper.joint_angles(gripper)
+        missing = [n for n in (*spec.arm_joints, *angles) if not full.existJointName(n)]
         if missing:
             raise unknown_name("joint", missing[0], list(full.names)[1:])
+        reference = pin.neutral(full)
+        for name, angle in angles.items():
+            reference[full.joints[full.getJointId(name)].idx_q] = angle
         locked = [
             full.getJointId(name) for name in list(full.names)[1:] if name not in spec.arm_joints
         ]
@@ -74,7 +81,12 @@ class RobotModel:
             raise unknown_name("frame", name, [f.name for f in self._model.frames])
         return int(self._model.getFrameId(name))
 
-    def _check_q(self, q: Array) -> Array:
+    def check_q(self, q: Array) -> Array:
+        """A float64 copy of a joint configuration `(n,)`.
+
+        Raises:
+            InvalidInput: wrong shape or not finite.
+        """
         return check_array("q", q, (self._model.nq,))
 
     def fk(self, q: Array, frame: str | None = None) -> Array:
@@ -85,7 +97,7 @@ class RobotModel:
             UnknownName: no such frame.
         """
         index = self._tool if frame is None else self._frame(frame)
-        pin.framesForwardKinematics(self._model, self._data, self._check_q(q))
+        pin.framesForwardKinematics(self._model, self._data, self.check_q(q))
         return np.array(self._data.oMf[index].homogeneous)
 
     def jacobian(self, q: Array, frame: str | None = None) -> Array:
@@ -97,7 +109,7 @@ class RobotModel:
         """
         index = self._tool if frame is None else self._frame(frame)
         J = pin.computeFrameJacobian(
-            self._model, self._data, self._check_q(q), index, pin.ReferenceFrame.LOCAL
+            self._model, self._data, self.check_q(q), index, pin.ReferenceFrame.LOCAL
         )
         return np.array(J)
 
@@ -117,7 +129,7 @@ class RobotModel:
             MotionRejected: the answer is farther than `max_step`.
         """
         desired = pin.SE3(check_pose("T_world_tool", T_world_tool))
-        start = self._check_q(q_near)
+        start = self.check_q(q_near)
         q = np.clip(start, self.lower, self.upper)
         model, data, tool = self._model, self._data, self._tool
         eye = _IK_DAMPING**2 * np.eye(6)
@@ -151,7 +163,7 @@ class RobotModel:
 
     def link_poses(self, q: Array) -> dict[str, Array]:
         """Every frame's pose `(4, 4)` in the world at `q`, by name."""
-        pin.framesForwardKinematics(self._model, self._data, self._check_q(q))
+        pin.framesForwardKinematics(self._model, self._data, self.check_q(q))
         return {
             frame.name: np.array(self._data.oMf[i].homogeneous)
             for i, frame in enumerate(self._model.frames)

@@ -65,6 +65,8 @@ class Attachment:
 
     def __post_init__(self) -> None:
         check_positive(f"mass of {self.name}", self.mass, "kg")
+        if not self.shapes:
+            raise InvalidInput(f"attachment {self.name!r}: has no shape; give it at least one")
         T = check_pose("T_frame_body", self.T_frame_body)
         object.__setattr__(self, "T_frame_body", frozen(T))
 
@@ -87,6 +89,9 @@ class CameraSpec:
     def __post_init__(self) -> None:
         if not 1.0 <= self.fov_y_deg <= 170.0:
             raise InvalidInput(f"fov_y_deg: expected 1 to 170 degrees, got {self.fov_y_deg}")
+        check_positive("near", self.near, "m")
+        if check_positive("far", self.far, "m") <= self.near:
+            raise InvalidInput(f"far: expected more than near ({self.near} m), got {self.far} m")
         T = check_pose("T_frame_camera", self.T_frame_camera)
         object.__setattr__(self, "T_frame_camera", frozen(T))
 
@@ -97,10 +102,18 @@ class CameraSpec:
 
 
 def look_at(p_camera: Array, p_target: Array, up: Array) -> Array:
-    """The camera pose `(4, 4)` at `p_camera`, z axis through `p_target`, `up` upwards."""
+    """The camera pose `(4, 4)` at `p_camera`, z axis through `p_target`, `up` upwards.
+
+    Raises:
+        InvalidInput: the camera would look at itself, or along `up`.
+    """
     z = np.asarray(p_target, float) - p_camera
-    z /= np.linalg.norm(z)
     x = np.cross(z, up)
+    if not np.linalg.norm(x) > 0:
+        raise InvalidInput(
+            "look_at: target and camera coincide, or lie along up; choose another up"
+        )
+    z /= np.linalg.norm(z)
     x /= np.linalg.norm(x)
     T = np.eye(4)
     T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = x, np.cross(z, x), z, p_camera
@@ -161,6 +174,8 @@ class RobotSpec:
         n = len(self.arm_joints)
         for name in ("home", "velocity_limits", "acceleration_limits", "jerk_limits"):
             object.__setattr__(self, name, frozen(check_array(name, getattr(self, name), (n,))))
+            if name != "home" and (getattr(self, name) <= 0).any():
+                raise InvalidInput(f"{name}: expected numbers > 0, got {getattr(self, name)}")
         T = check_pose("T_gripper_tool", self.T_gripper_tool)
         object.__setattr__(self, "T_gripper_tool", frozen(T))
 
@@ -174,7 +189,10 @@ def resource_path(resource: str) -> Path:
     """
     package, colon, inside = resource.partition(":")
     if colon:
-        found = importlib.util.find_spec(package)
+        try:
+            found = importlib.util.find_spec(package)
+        except (ModuleNotFoundError, ValueError):
+            found = None
         if found is None or found.origin is None:
             raise MissingExtra(f"{resource}: package {package!r} missing; pip install {package}")
         path = Path(found.origin).parent / inside

@@ -22,12 +22,12 @@ import fast_simplification
 import numpy as np
 import trimesh
 
-from sart_toolkit.errors import BrokenFile, InvalidInput
+from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, SartError, unknown_name
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape, resource_path
 
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 7
+_RECIPE = 8
 _ARM_FACES, _GRIPPER_FACES = 150, 300
 _GRIPPER_PREFIX = "gripper_"
 
@@ -63,19 +63,35 @@ def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
     directory = cache_dir() / f"{spec.name}-{key}"
     urdf = directory / "robot.urdf"
     if not urdf.exists():
-        directory.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(dir=directory.parent, prefix=f".{spec.name}-"))
         try:
-            _compose(spec, attachments, sources, work)
-            try:
-                os.replace(work, directory)
-            except OSError:
-                # Another process has just put the same files there.
-                if not urdf.exists():
-                    raise
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
+            _make(spec, attachments, sources, urdf)
+        except SartError:
+            raise
+        except OSError as error:
+            raise CannotWrite(
+                f"{directory}: {error.strerror or error}; set SART_CACHE to a folder that can be "
+                "written"
+            ) from error
     return urdf
+
+
+def _make(
+    spec: RobotSpec, attachments: Sequence[Attachment], sources: list[Path], urdf: Path
+) -> None:
+    """Compose in a temporary folder, then rename it to the URDF's own."""
+    directory = urdf.parent
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(dir=directory.parent, prefix=f".{spec.name}-"))
+    try:
+        _compose(spec, attachments, sources, work)
+        try:
+            os.replace(work, directory)
+        except OSError:
+            # Another process has just put the same files there.
+            if not urdf.exists():
+                raise
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def _plain(value: Any) -> Any:
@@ -110,6 +126,10 @@ def _compose(
         twice = sorted({str(name) for name in names if names.count(name) > 1})
         if twice:
             raise InvalidInput(f"{spec.name}: two {kind}s are called {twice[0]!r}; rename one")
+    links = [str(link.get("name")) for link in robot.findall("link")]
+    for end in robot.findall("joint/parent") + robot.findall("joint/child"):
+        if end.get("link") not in links:
+            raise unknown_name("frame", str(end.get("link")), links)
     for link in robot.findall("link"):
         if link.find("inertial") is None:
             # A simulator would give a link without inertia one kilogram.
@@ -120,7 +140,7 @@ def _compose(
 
 def _elements(source: Path, prefix: str) -> list[ET.Element]:
     """Links and joints of a URDF, names prefixed, vendor extensions left out."""
-    text = source.read_text()
+    text = source.read_text(errors="replace")
     # airo-models uses the prefix drake: without declaring it, which no XML parser accepts.
     text = re.sub(r"<(drake:\w+)\b.*?</\1>", "", text, flags=re.DOTALL)
     text = re.sub(r"\sdrake:\w+=\"[^\"]*\"", "", text)
@@ -131,9 +151,12 @@ def _elements(source: Path, prefix: str) -> list[ET.Element]:
     kept = [element for element in root if element.tag in ("link", "joint")]
     for element in kept:
         element.set("name", prefix + element.get("name", ""))
-        for tag, attribute in (("parent", "link"), ("child", "link"), ("mimic", "joint")):
+        for tag in ("parent", "child"):
             for child in element.findall(tag):
-                child.set(attribute, prefix + child.get(attribute, ""))
+                child.set("link", prefix + child.get("link", ""))
+        # The linkage is told by the robot's GripperSpec; readers treat mimic differently.
+        for mimic in element.findall("mimic"):
+            element.remove(mimic)
     return kept
 
 
@@ -211,6 +234,8 @@ def _decimated(mesh: trimesh.Trimesh, target: int) -> trimesh.Trimesh:
     vertices, faces = fast_simplification.simplify(
         np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), target_count=target
     )
+    # Where faces meet at a sharp angle the simplified corner may shoot far out.
+    vertices = np.clip(vertices, *mesh.bounds)
     return trimesh.Trimesh(vertices, faces, process=False)
 
 

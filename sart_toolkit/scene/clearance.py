@@ -72,7 +72,7 @@ class ClearanceModel:
         }
 
     def _joint_poses(self, q: Array) -> list[Array]:
-        pin.forwardKinematics(self.model.pinocchio_model, self._data, np.asarray(q, float))
+        pin.forwardKinematics(self.model.pinocchio_model, self._data, self.model.check_q(q))
         return [np.array(T.homogeneous) for T in self._data.oMi]
 
     def _placed_scene(
@@ -107,7 +107,8 @@ class ClearanceModel:
                 PairDistance(part.link, name, _distance(part.geometry, T, geometry, T_shape))
                 for name, geometry, T_shape in scene
             ]
-            nearest[i] = min(pairs, key=lambda pair: pair.distance)
+            nothing = PairDistance(part.link, "", np.inf)
+            nearest[i] = min(pairs, key=lambda pair: pair.distance, default=nothing)
         return nearest
 
     def arm_distance(self, q: Array, Ts_world_body: Mapping[str, Array]) -> PairDistance:

@@ -51,6 +51,10 @@ class SceneSpec:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise InvalidInput(f"scene: two bodies are called {twice[0]!r}; rename one")
+        cameras = [camera.name for camera in self.cameras]
+        twice = sorted({name for name in cameras if cameras.count(name) > 1})
+        if twice:
+            raise InvalidInput(f"scene: two cameras are called {twice[0]!r}; rename one")
         object.__setattr__(self, "gravity", frozen(check_array("gravity", self.gravity, (3,))))
 
     def initial_state(

@@ -86,7 +86,7 @@ def make_dataset(task: str = "peg_in_hole", n_episodes: int = 12) -> Dataset:
         success=s > 0.9,
         raw_commands=np.zeros((123, 7)),
         states=(),
-        operator="scripted",
+        operator="scripted operator",
         device="scripted",
         seconds=4.2,
     )

@@ -89,6 +89,6 @@ def make_tiny(tmp_path: Path, own_cache: Path) -> Callable[..., RobotSpec]:
             "T_gripper_tool": pose([0, 0, 0.1]),
             "wrist_camera": CameraSpec("wrist", "gripper_base_link", np.eye(4)),
         }
-        return RobotSpec(**{**fields, **changes})  # type: ignore[arg-type]
+        return RobotSpec(**{**fields, **changes})
 
     return make

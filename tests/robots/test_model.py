@@ -132,7 +132,7 @@ def test_a_pose_beyond_the_arm_is_unreachable(model, p):
 
 def test_an_answer_farther_than_the_greatest_step_is_rejected(model):
     T = model.fk(model.spec.home + 0.1)
-    with pytest.raises(MotionRejected, match="joint step of 0.10 rad exceeds 0.05 rad: the pose"):
+    with pytest.raises(MotionRejected, match="joint jump: a step of 0.10 rad exceeds 0.05 rad, "):
         model.ik(T, model.spec.home, max_step=0.05)
     model.ik(T, model.spec.home, max_step=0.11)
 

@@ -45,7 +45,9 @@ def test_a_shape_of_unknown_kind_is_refused():
         Shape("cone", (1, 1))
 
 
-@pytest.mark.parametrize(("kind", "size"), [("box", (1, 1)), ("cylinder", (1,)), ("sphere", (1, 1))])
+@pytest.mark.parametrize(
+    ("kind", "size"), [("box", (1, 1)), ("cylinder", (1,)), ("sphere", (1, 1))]
+)
 def test_a_size_with_the_wrong_count_is_refused(kind, size):
     with pytest.raises(InvalidInput, match=f"{kind} size: expected {SIZES[kind]} numbers, got"):
         Shape(kind, size)
@@ -127,9 +129,7 @@ def test_a_camera_that_looks_nowhere_or_straight_up_is_refused(target):
         look_at(np.zeros(3), target, np.array([0, 0, 1.0]))
 
 
-@pytest.mark.parametrize(
-    "name", ["home", "velocity_limits", "acceleration_limits", "jerk_limits"]
-)
+@pytest.mark.parametrize("name", ["home", "velocity_limits", "acceleration_limits", "jerk_limits"])
 def test_joint_arrays_must_have_one_number_a_joint(spec, name):
     with pytest.raises(InvalidInput, match=rf"{name}: expected shape \(6,\), got \(5,\)"):
         dataclasses.replace(spec, **{name: np.ones(5)})

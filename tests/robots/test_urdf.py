@@ -95,10 +95,11 @@ def test_every_link_has_an_inertia_that_a_body_can_have(robot):
         inertial = link.find("inertial")
         assert float(inertial.find("mass").get("value")) > 0
         xx, xy, xz, yy, yz, zz = (
-            float(inertial.find("inertia").get(k)) for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+            float(inertial.find("inertia").get(k))
+            for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
         least, middle, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        assert 0 < least
+        assert least > 0
         assert most <= (least + middle) * (1 + 1e-6), link.get("name")
 
 
@@ -255,7 +256,7 @@ def test_another_process_may_have_made_the_same_urdf_meanwhile(make_tiny, own_ca
     monkeypatch.setattr(os, "replace", beaten)
     path = composed_urdf(make_tiny())
     assert path.is_file()
-    assert [p for p in (own_cache / "sart_toolkit").iterdir()] == [path.parent]
+    assert list((own_cache / "sart_toolkit").iterdir()) == [path.parent]
 
 
 @pytest.mark.parametrize("step", ["mkdir", "replace"])

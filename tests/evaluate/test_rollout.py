@@ -1,0 +1,326 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from sart_toolkit.errors import CannotWrite, InvalidInput, MissingFile, SartError
+from sart_toolkit.evaluate import rollout as module
+from sart_toolkit.evaluate.rollout import (
+    EvaluateConfig,
+    episode_placement,
+    evaluate_skill,
+    run_rollout,
+)
+from sart_toolkit.evaluate.statistics import wilson_interval
+from sart_toolkit.learn.skill import save_skill
+from sart_toolkit.learn.training import TrainConfig, train
+from sart_toolkit.records import RECORD_HZ
+from sart_toolkit.storage import read_json
+from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks.task import Placement
+
+STILL = np.append(np.zeros(6), 0.67)
+
+
+class Player:
+    """A made-up skill: plays actions whatever it sees, then holds still."""
+
+    def __init__(self, actions=()):
+        self.actions = [np.array(action) for action in actions]
+        self.config = SimpleNamespace(
+            camera="wrist", robot="ur5e_2f85", training=SimpleNamespace(policy="player")
+        )
+        self.seen = []
+
+    def reset(self):
+        self.seen = []
+
+    def act(self, rgb, gripper):
+        self.seen.append((rgb, gripper))
+        at = len(self.seen) - 1
+        return self.actions[at] if at < len(self.actions) else STILL
+
+
+@pytest.fixture(scope="module")
+def replay(peg_demonstration):
+    """The demonstration's own actions, as good as they are where it was shown."""
+    return Player(peg_demonstration.actions)
+
+
+@pytest.fixture
+def roll_out(peg_backend, peg_model, peg_task):
+    def roll_out(skill, placement=None, task=None, **options):
+        return run_rollout(
+            skill, task or peg_task, peg_backend, peg_model, placement or Placement(), **options
+        )
+
+    return roll_out
+
+
+# --- one rollout --------------------------------------------------------------------------------
+
+
+def test_replaying_the_demonstration_where_it_was_shown_succeeds(
+    roll_out, replay, peg_task, peg_demonstration
+):
+    result = roll_out(replay, seed=(5, 3))
+    assert result.success and result.success_any and result.reason is None
+    assert (result.episode, result.seed) == (3, (5, 3))
+    first = int(np.argmax(peg_demonstration.success))
+    assert result.steps == pytest.approx(first + peg_task.hold * RECORD_HZ - 1, abs=2)
+
+
+def test_a_rollout_ends_as_soon_as_success_has_lasted(roll_out, replay):
+    watched = []
+    result = roll_out(replay, watch=lambda *seen: watched.append(seen))
+    held = [success for _, _, success in watched]
+    first = held.index(True)
+    assert held == [False] * first + [True] * 10
+    assert [step for _, step, _ in watched] == list(range(1, result.steps + 1))
+
+
+def test_how_long_success_must_last_is_the_task_s(roll_out, replay):
+    task = get_task("peg_in_hole")
+    task.hold = 0.3
+    assert roll_out(replay, task=task).steps == roll_out(replay).steps - 7
+
+
+def test_replaying_the_demonstration_elsewhere_fails_and_says_by_how_much(roll_out, replay):
+    result = roll_out(replay, Placement(0.045, -0.045))
+    assert not result.success and not result.success_any
+    assert re.match(r"peg 4\d mm beside the hole's axis, tip", result.reason)
+
+
+def test_a_rollout_ends_at_the_horizon_with_the_shortfall(roll_out):
+    task = get_task("peg_in_hole")
+    task.horizon = 1.2
+    result = roll_out(Player(), task=task)
+    assert result.steps == 12 and not result.success
+    assert "125 mm" in result.reason
+
+
+def test_success_that_does_not_last_is_counted_apart(roll_out, peg_demonstration):
+    first = int(np.argmax(peg_demonstration.success)) + 2
+    up = np.append([0, 0, -0.01, 0, 0, 0], 0.67)
+    task = get_task("peg_in_hole")
+    task.horizon = first / RECORD_HZ + 1.5
+    result = roll_out(Player([*peg_demonstration.actions[:first], *[up] * 30]), task=task)
+    assert result.success_any and not result.success
+    assert "peg" in result.reason
+    assert result.to_json("block")["outcome"] == "failure"
+    assert result.to_json("block")["success_any"] is True
+
+
+def test_steering_out_of_reach_ends_the_rollout_with_that_reason(roll_out, peg_model):
+    away = peg_model.fk(peg_model.spec.home)[:3, :3].T @ [0.019, 0.0, 0.0]
+    result = roll_out(Player([np.append([*away, 0, 0, 0], 0.67)] * 100))
+    assert not result.success and result.steps < 60
+    assert result.reason.startswith("steered out of reach: tool pose at (")
+
+
+def test_a_skill_sees_the_wrist_picture_and_the_gripper_at_every_step(
+    roll_out, replay, peg_demonstration
+):
+    result = roll_out(replay)
+    assert len(replay.seen) == result.steps
+    recorded = peg_demonstration.steps
+    np.testing.assert_array_equal(replay.seen[0][0], recorded.cameras["wrist"].rgb[0])
+    assert replay.seen[0][1] == recorded.measured_gripper[0]
+    assert replay.seen[-1][1] == pytest.approx(0.67, abs=1e-3)
+
+
+def test_the_same_rollout_twice_is_the_same(roll_out, replay):
+    task = get_task("peg_in_hole")
+    task.horizon = 3.0
+    pictures = []
+    for _ in range(2):
+        pictures.append([])
+        roll_out(
+            replay, Placement(0.01, 0.02), task, watch=lambda rgb, *_: pictures[-1].append(rgb)
+        )
+    np.testing.assert_array_equal(*pictures)
+    assert len(pictures[0]) == 30
+
+
+# --- many rollouts ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def short_task():
+    task = get_task("peg_in_hole")
+    task.horizon = 0.6
+    return task
+
+
+@pytest.fixture
+def evaluate(monkeypatch, make_peg_backend, tmp_path):
+    """Evaluates a made-up skill in place of a trained one."""
+
+    def evaluate(skill, task, config=None, **options):
+        monkeypatch.setattr(module, "load_skill", lambda *_, **__: skill)
+        return evaluate_skill(tmp_path, task, make_peg_backend, config, **options)
+
+    return evaluate
+
+
+def test_placements_follow_from_the_evaluation_seed_and_the_episode_alone(peg_task):
+    drawn = [episode_placement(peg_task, 7, i) for i in range(50)]
+    assert drawn == [episode_placement(peg_task, 7, i) for i in range(50)]
+    assert len({(p.x, p.y) for p in drawn}) == 50
+    assert drawn != [episode_placement(peg_task, 8, i) for i in range(50)]
+
+
+def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
+    evaluate, short_task, tmp_path
+):
+    progress = []
+    out = tmp_path / "evaluation.json"
+    config = EvaluateConfig(episodes=3, eval_seed=11, videos=0)
+    result = evaluate(
+        Player(), short_task, config, out=out, progress=lambda *counts: progress.append(counts)
+    )
+    assert read_json(out) == json.loads(json.dumps(result))
+    assert result["task"] == "peg_in_hole" and result["backend"] == "pybullet"
+    assert result["robot"] == "ur5e_2f85" and result["policy"] == "player"
+    assert (result["n_episodes"], result["n_success"], result["success_rate"]) == (3, 0, 0.0)
+    assert (result["n_success_any"], result["success_rate_any"]) == (0, 0.0)
+    assert result["ci95"] == result["ci95_any"] == list(wilson_interval(0, 3))
+    assert result["seeds"] == {"eval_seed": 11, "episodes": [[11, 0], [11, 1], [11, 2]]}
+    assert result["seconds"] > 0 and result["videos"] == [] and "python" in result["versions"]
+    assert result["config"] == {"episodes": 3, "eval_seed": 11, "videos": 0}
+    for i, row in enumerate(result["episodes"]):
+        assert row["episode"] == i and row["seed"] == [11, i] and row["steps"] == 6
+        assert row["placement"] == {"block": episode_placement(short_task, 11, i).to_json()}
+        assert row["outcome"] == "failure" and row["success_any"] is False and row["reason"]
+    assert progress == [(1, 3, 0), (2, 3, 0), (3, 3, 0)]
+
+
+def test_successes_are_counted_and_carry_no_reason(evaluate, replay, peg_demonstration):
+    task = get_task("peg_in_hole")
+    task.placement_range = 0.002
+    task.hold = 0.1
+    result = evaluate(replay, task, EvaluateConfig(episodes=2, videos=0))
+    assert result["n_success"] == result["n_success_any"] == 2
+    assert result["ci95"] == list(wilson_interval(2, 2))
+    assert [row["reason"] for row in result["episodes"]] == [None, None]
+    assert [row["outcome"] for row in result["episodes"]] == ["success", "success"]
+
+
+def test_the_same_seed_gives_the_same_rows_and_another_seed_other_placements(evaluate, short_task):
+    def rows(seed):
+        config = EvaluateConfig(episodes=2, eval_seed=seed, videos=0)
+        return evaluate(Player(), short_task, config)["episodes"]
+
+    assert rows(1) == rows(1)
+    assert rows(1)[0]["placement"] != rows(2)[0]["placement"]
+
+
+def test_the_first_failures_are_filmed_beside_the_result(evaluate, short_task, tmp_path):
+    config = EvaluateConfig(episodes=3, videos=2)
+    result = evaluate(Player(), short_task, config, out=tmp_path / "e" / "evaluation.json")
+    assert [(row["episode"], row["outcome"]) for row in result["videos"]] == [
+        (0, "failure"),
+        (1, "failure"),
+    ]
+    for row in result["videos"]:
+        assert (tmp_path / "e" / row["path"]).stat().st_size > 1000
+
+
+def test_a_rollout_that_ends_before_its_first_step_does_not_stop_the_evaluation(
+    evaluate, short_task, peg_model, tmp_path
+):
+    stretched = np.array([0.0, -0.6, 0.02, -1.0, -np.pi / 2, 0.0])
+    start = short_task.initial_state
+
+    def initial_state(model, placement):
+        return dataclasses.replace(start(model, placement), q=stretched)
+
+    short_task.initial_state = initial_state
+    away = peg_model.fk(stretched)[:3, :3].T @ [0.019, 0.0, -0.01]
+    skill = Player([np.append([*away, 0, 0, 0], 0.67)] * 9)
+    config = EvaluateConfig(episodes=1, videos=1)
+    result = evaluate(skill, short_task, config, out=tmp_path / "e" / "evaluation.json")
+    assert result["episodes"][0]["steps"] == 0
+    assert result["episodes"][0]["reason"].startswith("steered out of reach")
+
+
+def test_nothing_is_written_unless_asked(evaluate, short_task, tmp_path):
+    result = evaluate(Player(), short_task, EvaluateConfig(episodes=1, videos=2))
+    assert result["videos"] == [] and list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def skill_directory(peg_dataset, tmp_path_factory):
+    """A skill that has learned next to nothing."""
+    out = tmp_path_factory.mktemp("skill")
+    config = TrainConfig.for_policy(
+        "compact_mlp", epochs=1, image_size=32, batch_size=16, hidden=16, threads=1, device="cpu"
+    )
+    save_skill(out, train(peg_dataset, config, out), peg_dataset)
+    return out
+
+
+def test_two_processes_give_the_rows_of_one_and_leave_torch_s_threads_alone(
+    skill_directory, short_task, make_peg_backend
+):
+    config = EvaluateConfig(episodes=2, videos=0)
+    before = torch.get_num_threads()
+    try:
+        results = [
+            evaluate_skill(skill_directory, short_task, make_peg_backend, config, workers=workers)
+            for workers in (1, 2)
+        ]
+        assert results[0]["episodes"] == results[1]["episodes"]
+        assert results[0]["policy"] == "compact_mlp"
+        assert torch.get_num_threads() == before
+    finally:
+        torch.set_num_threads(before)
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_at_least_one_process_is_needed(evaluate, short_task, workers):
+    with pytest.raises(InvalidInput, match=f"workers: expected at least 1, got {workers}"):
+        evaluate(Player(), short_task, workers=workers)
+
+
+def test_a_missing_skill_is_refused(peg_task, make_peg_backend, tmp_path):
+    with pytest.raises(MissingFile, match="no such skill directory"):
+        evaluate_skill(tmp_path / "none", peg_task, make_peg_backend)
+
+
+def test_a_result_that_cannot_be_written_is_an_error(evaluate, short_task, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CannotWrite, match="nothing was replaced"):
+        evaluate(
+            Player(),
+            short_task,
+            EvaluateConfig(episodes=1, videos=0),
+            out=tmp_path / "file" / "evaluation.json",
+        )
+
+
+def test_a_skill_that_gives_nonsense_is_an_error_not_a_crash(roll_out):
+    with pytest.raises(SartError, match="NaN"):
+        roll_out(Player([np.full(7, np.nan)]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"episodes": 0}, "episodes: expected at least 1, got 0"),
+        ({"eval_seed": -1}, "eval_seed: expected a whole number >= 0, got -1"),
+        ({"videos": -1}, "videos: expected at least 0, got -1"),
+    ],
+)
+def test_a_bad_setting_is_refused(changes, message):
+    with pytest.raises(InvalidInput, match=message):
+        EvaluateConfig(**changes)
