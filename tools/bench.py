@@ -7,6 +7,7 @@ and one line in `BENCHMARKS`.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -56,91 +57,114 @@ _SEGMENT_STEPS = 20
 def bench_train(arguments: Sequence[str]) -> dict[str, Any]:
     """Images/s of the training loop, of the same model's bare steps, and their ratio, by policy.
 
-    Both run in turns in this process: an epoch or two through `learn.training.train` (windows drawn
-    and shifted, losses kept, checkpoints), then as many forward-backward-step rounds on one batch
-    that is loaded already. The ratio is the median over the turns.
+    Steps of both alternate in this process, so that whatever else the machine does slows both: one
+    through `learn.training.train` (everything from one step's end to the next's: windows drawn,
+    gathered and shifted, losses kept, epochs, checkpoints), one of forward, backward and optimizer
+    on a batch that is loaded already. The ratio is the median over blocks of steps.
     """
     parser = argparse.ArgumentParser(prog="bench.py train", description=bench_train.__doc__)
     parser.add_argument("--policy", default="all", help=f"all, {', '.join(POLICIES)}")
-    parser.add_argument("--repeats", type=int, default=7, help="turns of each loop")
-    parser.add_argument("--seconds", type=float, default=2.0, help="about, for one turn")
+    parser.add_argument("--blocks", type=int, default=10, help="blocks of steps, for the median")
+    parser.add_argument("--seconds", type=float, default=30.0, help="about, for each policy")
     parser.add_argument("--image-size", type=int, help="[pixels]; the policy's own if left out")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
     parser.add_argument("--threads", type=int, help="torch's threads; its own choice if left out")
     options = parser.parse_args(arguments)
-    check_positive("--repeats", options.repeats)
+    check_positive("--blocks", options.blocks)
     check_positive("--seconds", options.seconds)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    overrides: dict[str, Any] = {"device": options.device, "epochs": 1}
+    overrides: dict[str, Any] = {"device": options.device}
     if options.image_size is not None:
         overrides["image_size"] = options.image_size
     policies = list(POLICIES) if options.policy == "all" else [options.policy]
     return {
         policy: _train_figures(
-            TrainConfig.for_policy(policy, **overrides), options.repeats, options.seconds
+            TrainConfig.for_policy(policy, **overrides), options.blocks, options.seconds
         )
         for policy in policies
     }
 
 
-def _train_figures(config: TrainConfig, repeats: int, seconds: float) -> dict[str, Any]:
-    windows = build_windows(_synthetic_dataset(1), config.camera, config.image_size, config.history)
+def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[str, Any]:
+    device = resolve_device(config.device)
+    windows = build_windows(_synthetic_dataset(2), config.camera, config.image_size, config.history)
     first = torch.arange(config.batch_size) % len(windows.history)
-    batch = windows.to(resolve_device(config.device)).batch(first)
+    bare_step = _bare_stepper(config, windows.to(device).batch(first))
     # The first steps choose and compile kernels.
-    _bare_seconds(config, batch, 2)
-    n_steps = max(4, round(seconds / (_bare_seconds(config, batch, 4) / 4)))
+    step_seconds = [bare_step() for _ in range(6)]
+    per_block = max(2, round(seconds / (2 * statistics.median(step_seconds[2:]) * n_blocks)))
+    n_steps = (n_blocks + 1) * per_block
+    # At most 39 generated trajectories, and two epochs at least so that an epoch's end is counted.
     per_trajectory = _DEMONSTRATION_STEPS // 2 + _SEGMENT_STEPS
-    n_windows = n_steps * config.batch_size - _DEMONSTRATION_STEPS
-    dataset = _synthetic_dataset(max(1, round(n_windows / per_trajectory)))
-    loop, bare = [], []
+    n_episodes = min(39, max(2, n_steps * config.batch_size // (2 * per_trajectory)))
+    dataset = _synthetic_dataset(n_episodes)
+    n_windows = _DEMONSTRATION_STEPS + n_episodes * per_trajectory
+    n_batches = -(-n_windows // config.batch_size)
+    config = dataclasses.replace(config, epochs=-(-n_steps // n_batches))
+
+    loop_seconds: list[float] = []
+    bare_seconds: list[float] = []
+    last = time.perf_counter()
+
+    def between_steps(done: int, total: int, text: str) -> None:
+        nonlocal last
+        _synchronise(device)
+        loop_seconds.append(time.perf_counter() - last)
+        bare_seconds.append(bare_step())
+        if done % per_block == 0:
+            _say(f"{config.policy} step {done}/{total}")
+        last = time.perf_counter()
+
     with tempfile.TemporaryDirectory() as scratch:
-        for turn in range(repeats + 1):
-            result = train(dataset, config, Path(scratch), resume=False)
-            rounds = -(-result.n_windows // config.batch_size)
-            n_images = rounds * config.batch_size * config.history
-            bare_rate = n_images / _bare_seconds(config, batch, rounds)
-            _say(
-                f"{config.policy} turn {turn}/{repeats}: loop {result.images_per_second:.0f}, "
-                f"bare {bare_rate:.0f} images/s{' (warming up)' if turn == 0 else ''}"
-            )
-            if turn > 0:
-                loop.append(result.images_per_second)
-                bare.append(bare_rate)
+        result = train(dataset, config, Path(scratch), progress=between_steps)
+    # The first block warms up.
+    blocks = [slice(i * per_block, (i + 1) * per_block) for i in range(1, n_blocks + 1)]
+    loop_images = n_windows / n_batches * config.history * per_block
+    bare_images = config.batch_size * config.history * per_block
+    loop = [loop_images / sum(loop_seconds[block]) for block in blocks]
+    bare = [bare_images / sum(bare_seconds[block]) for block in blocks]
     ratios = [a / b for a, b in zip(loop, bare, strict=True)]
     return {
         "loop_images_per_second": statistics.median(loop),
         "bare_images_per_second": statistics.median(bare),
         "loop_over_bare": statistics.median(ratios),
         "loop_over_bare_range": [min(ratios), max(ratios)],
-        "repeats": repeats,
-        "steps_per_repeat": rounds,
+        "blocks": n_blocks,
+        "steps_per_block": per_block,
         "batch_size": config.batch_size,
         "history": config.history,
         "image_size": config.image_size,
+        "image_shift": config.image_shift,
         "device": result.device,
         "bfloat16": result.bfloat16,
         "threads": torch.get_num_threads(),
     }
 
 
-def _bare_seconds(config: TrainConfig, batch: Batch, n_steps: int) -> float:
-    """Seconds of forward-backward-step rounds on one batch, nothing else."""
+def _bare_stepper(config: TrainConfig, batch: Batch) -> Callable[[], float]:
+    """A function that takes one forward-backward-step on a batch and returns its seconds."""
     device = resolve_device(config.device)
     bfloat16 = resolve_bfloat16(config.bfloat16, device)
     policy = build_policy(config).to(device).train()
     optimizer = make_optimizer(policy, config)
-    frames, gripper, actions = batch
-    began = time.perf_counter()
-    for _ in range(n_steps):
+
+    def step() -> float:
+        began = time.perf_counter()
         with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16):
-            loss = policy.loss(frames, gripper, actions)
+            loss = policy.loss(*batch)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-    loss.item()
-    return time.perf_counter() - began
+        _synchronise(device)
+        return time.perf_counter() - began
+
+    return step
+
+
+def _synchronise(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 def _synthetic_dataset(n_episodes: int) -> Dataset:

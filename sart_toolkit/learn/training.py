@@ -26,6 +26,7 @@ from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.windows import build_windows
 from sart_toolkit.poses import check_positive
 from sart_toolkit.records import Dataset
+from sart_toolkit.storage import check_writable
 
 CHECKPOINT = "checkpoint.safetensors"
 _CHECKPOINT_SECONDS = 30.0
@@ -257,6 +258,7 @@ def train(
         SartError: the loss is not finite any more.
     """
     device = resolve_device(config.device)
+    check_writable(Path(out) / CHECKPOINT, overwrite=True)
     with _torch_threads(config.threads), _deferred_interrupt() as interrupted:
         return _Training(dataset, config, Path(out), device, resume).run(progress, interrupted)
 

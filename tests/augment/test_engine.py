@@ -11,6 +11,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from sart_toolkit.augment import engine
 from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration, try_segment
 from sart_toolkit.augment.strategies import STRATEGIES
 from sart_toolkit.backends.interface import Backend, Capabilities
@@ -240,7 +241,7 @@ def test_a_line_too_fast_for_the_joints_is_one_reason_whatever_time_it_needs(
     annotate, augment, tmp_path
 ):
     config = AugmentConfig(n=2, duration=0.1)
-    with pytest.raises(InvalidInput, match=r"none of 20 tries was kept \(motion: [^)]*: 20\)"):
+    with pytest.raises(InvalidInput, match=r"none of 20 tries was kept \(joint limits: 20\)"):
         augment(annotate((0, 0.1)), tmp_path / "d", config)
 
 
@@ -350,10 +351,24 @@ def test_a_log_whose_last_line_was_cut_is_resumed(
     assert len(rows) == crowded_dataset.info["n_attempted"]
 
 
+@pytest.mark.parametrize("writer", ["save_demonstration", "save_annotation", "write_json"])
+def test_an_interruption_while_the_directory_is_set_up_can_be_resumed(
+    augment, crowded, crowded_dataset, tmp_path, monkeypatch, writer
+):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(engine, writer, interrupt)
+        augment(crowded, tmp_path / "d")
+    assert augment(crowded, tmp_path / "d").content_hash() == crowded_dataset.content_hash()
+
+
 _CHAIN = """
 import sys
 import numpy as np
 from pathlib import Path
+from sart_toolkit.augment import engine
 from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
 from sart_toolkit.backends import make_backend
 from sart_toolkit.robots import get_robot

@@ -20,7 +20,7 @@ def _threads_put_back():
 
 
 def test_the_training_benchmark_ends_with_one_json_object(capsys):
-    arguments = "train --policy compact_mlp --repeats 2 --seconds 0.05 --image-size 16 --threads 1"
+    arguments = "train --policy compact_mlp --blocks 2 --seconds 0.05 --image-size 16 --threads 1"
     assert bench.main(arguments.split()) == 0
     out, err = capsys.readouterr()
     report = json.loads(out.splitlines()[-1])
@@ -29,7 +29,7 @@ def test_the_training_benchmark_ends_with_one_json_object(capsys):
     low, high = figures["loop_over_bare_range"]
     assert low <= figures["loop_over_bare"] <= high
     assert report["machine"]["cores"] >= 1 and "torch" in report["versions"]
-    assert "compact_mlp turn 2/2" in err and len(out.splitlines()) == 1
+    assert "compact_mlp step" in err and len(out.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_the_training_benchmark_ends_with_one_json_object(capsys):
     [
         (["trian"], "unknown benchmark 'trian': did you mean 'train'"),
         (["train", "--policy", "compact"], "unknown policy 'compact': did you mean 'compact_mlp'"),
-        (["train", "--repeats", "0"], "--repeats: expected a finite number > 0"),
+        (["train", "--blocks", "0"], "--blocks: expected a finite number > 0"),
         (["train", "--seconds", "nan"], "--seconds: expected a finite number > 0"),
     ],
 )

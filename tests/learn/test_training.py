@@ -6,7 +6,7 @@ import threading
 import pytest
 import torch
 
-from sart_toolkit.errors import InvalidInput, Mismatch, SartError, UnknownName
+from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, SartError, UnknownName
 from sart_toolkit.learn import training
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.learn.policies.resnet18_mlp import ResNet18
@@ -300,6 +300,19 @@ def test_a_checkpoint_of_another_version_is_refused(dataset, small_config, tmp_p
     save_tensors(tmp_path / CHECKPOINT, tensors, about)
     with pytest.raises(Mismatch, match="does not fit this version's compact_mlp"):
         train(dataset, small_config, tmp_path)
+
+
+def test_a_disk_that_refuses_is_reported_before_training(dataset, small_config, tmp_path):
+    (tmp_path / "file").write_text("kept")
+    steps = []
+    with pytest.raises(CannotWrite, match="is not a directory"):
+        train(
+            dataset,
+            small_config,
+            tmp_path / "file" / "skill",
+            progress=lambda *args: steps.append(args),
+        )
+    assert not steps
 
 
 def test_training_starts_from_backbone_weights(dataset, tmp_path):

@@ -104,6 +104,13 @@ def test_between_two_spheres_no_waypoint_has_room(
                 suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [t])
 
 
+def test_suggested_lengths_are_whole_micrometres(peg_annotation):
+    """The distance library's last digits change with what the process computed before."""
+    for sphere in peg_annotation.spheres:
+        for length in (sphere.radius, sphere.clearance):
+            assert length == round(length, 6)
+
+
 def test_the_first_sphere_covers_every_placement(peg_task, peg_annotation):
     assert peg_annotation.spheres[0].radius >= np.hypot(*[peg_task.placement_range] * 2)
 
@@ -155,14 +162,14 @@ def test_a_rotation_free_augmentation_gets_larger_spheres_and_a_margin_smaller_o
     assert first(rotation_per_metre=0.0) > first() > first(margin=0.005)
 
 
-def test_the_arm_s_reach_shrinks_a_radius(peg_demonstration, clearances):
+def test_the_arm_s_reach_and_own_links_shrink_a_radius(peg_demonstration, clearances):
     steps = peg_demonstration.steps
     far = {name: Ts[0] @ pose([0, 0, -5]) for name, Ts in peg_demonstration.body_Ts_world.items()}
     q, T = steps.joint_positions[0], steps.measured_Ts_world_tool[0]
     config = SuggestConfig(max_radius=2.0, rotation_per_metre=0.1)
     found = suggest_radius(clearances(0), q, T, far, config)
     assert 0.1 < found.radius < 1.0
-    assert found.limited_by == "reach" or "upper_arm" in found.limited_by
+    assert found.limited_by != "max_radius" and "table" not in found.limited_by
 
 
 def test_with_nothing_near_the_largest_radius_is_suggested(peg_demonstration, clearances):
