@@ -352,6 +352,7 @@ def save_episode(path: Path, episode: Episode) -> None:
     with _writing(path, "episode") as file:
         _put_steps(file.create_group("steps"), episode.steps)
         file.attrs["provenance"] = json.dumps(provenance)
+        file.attrs["content_hash"] = episode.content_hash()
 
 
 def load_episode(path: Path) -> Episode:
@@ -363,7 +364,10 @@ def load_episode(path: Path) -> Episode:
     """
     with _reading(path, "episode") as file:
         provenance = Provenance(**json.loads(file.attrs["provenance"]))
-        return Episode(steps=_get_steps(file["steps"]), provenance=provenance)
+        episode = Episode(steps=_get_steps(file["steps"]), provenance=provenance)
+        if file.attrs["content_hash"] != episode.content_hash():
+            raise BrokenFile(f"{path}: content differs from its hash; generate it again")
+        return episode
 
 
 # --- annotations and datasets -------------------------------------------------------------------

@@ -6,10 +6,11 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from typing import Any, Protocol, TypeVar
 
-from sart_toolkit.errors import InvalidInput
+from sart_toolkit.errors import InvalidInput, SartError
 
 Item = TypeVar("Item", contravariant=True)
 Result = TypeVar("Result", covariant=True)
@@ -51,6 +52,7 @@ def worker_map(
 
     Raises:
         InvalidInput: `processes` is not positive.
+        SartError: a process ended unexpectedly.
     """
     if processes < 1:
         raise InvalidInput(f"workers: expected at least 1, got {processes}")
@@ -63,5 +65,10 @@ def worker_map(
     pool = ProcessPoolExecutor(processes, context, _start, (make_worker,))
     try:
         yield lambda items: pool.map(_work, items)
+    except BrokenProcessPool as error:
+        raise SartError(
+            "a worker process ended before its work was done (out of memory, or its start failed); "
+            "use fewer workers, or one to see the reason"
+        ) from error
     finally:
         pool.shutdown(cancel_futures=True)

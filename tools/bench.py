@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib.metadata
+import functools
 import json
-import os
-import platform
 import statistics
 import sys
 import tempfile
@@ -23,6 +21,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from sart_toolkit import doctor
+from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
+from sart_toolkit.backends import make_backend
 from sart_toolkit.errors import SartError, unknown_name
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.learn.training import (
@@ -44,9 +45,16 @@ from sart_toolkit.records import (
     PrecisionSphere,
     Provenance,
     Steps,
+    library_versions,
 )
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.tasks import TASKS, get_task
+from sart_toolkit.tasks.task import Placement
+from sart_toolkit.teach.scripted import ScriptedOperator
+from sart_toolkit.teach.session import record_demonstration
+from sart_toolkit.teach.suggest import suggest_annotation
 
-_VERSIONS_OF = ("sart_toolkit", "torch", "numpy", "pybullet", "h5py", "pin", "coal", "ruckig")
 _DEMONSTRATION_STEPS = 60
 _SEGMENT_STEPS = 20
 
@@ -222,44 +230,59 @@ def _synthetic_dataset(n_episodes: int) -> Dataset:
     return Dataset(demonstration, Annotation((PrecisionSphere(0, key, 0.1),), sha), episodes)
 
 
-# --- the table, the machine ---------------------------------------------------------------------
-
-BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
-    "train": bench_train,
-}
+# --- augmentation -------------------------------------------------------------------------------
 
 
-def machine_info() -> dict[str, Any]:
-    """Processor, usable cores, memory, CUDA device and Python of this machine, without its name."""
+def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
+    """Kept trajectories per second and simulated over wall time, one process, RGB and depth kept.
+
+    A whole call of the engine each time: loading the simulator, every try, writing the episodes.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py augment", description=bench_augment.__doc__)
+    parser.add_argument("--task", default="peg_in_hole", help=", ".join(TASKS))
+    parser.add_argument("--n", type=int, default=40, help="trajectories, the demonstration counts")
+    parser.add_argument("--image-size", type=int, default=128, help="[pixels]")
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args(arguments)
+    check_positive("--repeats", options.repeats)
+    task = get_task(options.task)
+    robot = get_robot(task.robot)
+    make = functools.partial(make_backend, "pybullet", robot, task.scene, options.image_size)
+    model = RobotModel(robot, task.scene.held)
+    plan = task.plan(task.initial_state(model, Placement()))
+    operator = ScriptedOperator(plan, np.random.default_rng(0))
+    demonstration = record_demonstration(make(), task, model, operator)
+    annotation = suggest_annotation(demonstration, robot, task.scene)
+    per_second, over_wall = [], []
+    with tempfile.TemporaryDirectory() as scratch:
+        for turn in range(options.repeats):
+            started = time.perf_counter()
+            info = augment_demonstration(
+                demonstration, annotation, make, Path(scratch) / str(turn), AugmentConfig(options.n)
+            ).info
+            seconds = time.perf_counter() - started
+            per_second.append(info["n_kept"] / seconds)
+            over_wall.append(info["simulated_seconds"] / seconds)
+            _say(f"turn {turn + 1}/{options.repeats}: {per_second[-1]:.2f} kept trajectories/s")
     return {
-        "cpu": _cpu_model(),
-        "cores": len(os.sched_getaffinity(0)),
-        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
-        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        "load_average": os.getloadavg()[0],
+        "kept_trajectories_per_second": statistics.median(per_second),
+        "kept_trajectories_per_second_range": [min(per_second), max(per_second)],
+        "simulated_over_wall": statistics.median(over_wall),
+        "kept": info["n_kept"],
+        "attempted": info["n_attempted"],
+        "rejections": info["rejections"],
+        "image_size": options.image_size,
+        "processes": 1,
+        "repeats": options.repeats,
     }
 
 
-def versions() -> dict[str, str]:
-    """Versions of the packages that benchmarks depend on, of those that are installed."""
-    found = {}
-    for name in _VERSIONS_OF:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
+# --- the table, the machine ---------------------------------------------------------------------
 
-
-def _cpu_model() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor() or platform.machine()
+BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
+    "augment": bench_augment,
+    "train": bench_train,
+}
 
 
 def _say(text: str) -> None:
@@ -275,7 +298,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if parsed.name not in BENCHMARKS:
             raise unknown_name("benchmark", parsed.name, BENCHMARKS)
-        machine = machine_info()
+        machine = doctor.machine()
         figures = BENCHMARKS[parsed.name](parsed.arguments)
     except SartError as error:
         _say(f"error: {error}")
@@ -284,7 +307,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "benchmark": parsed.name,
         "figures": figures,
         "machine": machine,
-        "versions": versions(),
+        "versions": library_versions(),
     }
     print(json.dumps(report))
     return 0

@@ -26,6 +26,7 @@ from sart_toolkit.errors import (
     MotionRejected,
     OutputExists,
     Unreachable,
+    unknown_name,
 )
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.motion.line import straight_line
@@ -243,10 +244,13 @@ def augment_demonstration(
         "demonstration": demonstration.content_hash(),
         "annotation": annotation_to_json(annotation),
     }
+    # All that can be refused is refused before anything is replaced.
+    if workers < 1:
+        raise InvalidInput(f"workers: expected at least 1, got {workers}")
+    _check_capable(make_backend, config.camera)
     finished = _prepare(out, request, demonstration, annotation, overwrite)
     if finished is not None:
         return finished
-    _check_capable(make_backend)
     outcomes = _read_attempts(out)
     quotas = [
         len(range(i, config.n - 1, len(annotation.spheres))) for i in range(len(annotation.spheres))
@@ -275,17 +279,20 @@ def _prepare(
 ) -> Dataset | None:
     """Set the directory up; the dataset itself if it is already whole."""
     if (out / "request.json").exists() and not overwrite:
-        if read_json(out / "request.json") == json.loads(json.dumps(request)):
-            return load_dataset(out) if (out / "dataset.json").exists() else None
-        raise OutputExists(
-            f"{out}: holds a dataset made with other settings; add --overwrite or choose another "
-            "--out"
-        )
-    clear_directory(out, "request.json", overwrite)
+        if read_json(out / "request.json") != json.loads(json.dumps(request)):
+            raise OutputExists(
+                f"{out}: holds a dataset made with other settings; add --overwrite or choose "
+                "another --out"
+            )
+        if (out / "dataset.json").exists():
+            return load_dataset(out)
+    else:
+        clear_directory(out, "request.json", overwrite)
+        # First of all, so that an interruption from here on leaves a directory to go on in.
+        write_json(out / "request.json", request)
     save_demonstration(out / "demo.h5", demonstration)
     save_annotation(out / "annotation.json", annotation)
-    (out / "episodes").mkdir()
-    write_json(out / "request.json", request)
+    (out / "episodes").mkdir(exist_ok=True)
     return None
 
 
@@ -326,9 +333,11 @@ def _next_batch(outcomes: dict[tuple[int, int], str], quotas: list[int]) -> list
     return sorted(batch, key=lambda at: (at[1], at[0]))
 
 
-def _check_capable(make_backend: BackendFactory) -> None:
+def _check_capable(make_backend: BackendFactory, camera: str) -> None:
     with closing(make_backend()) as backend:
         can = backend.capabilities
+        if camera not in backend.cameras:
+            raise unknown_name("camera", camera, backend.cameras)
         if not (can.can_restore and can.has_contacts and can.renders):
             raise MissingCapability(
                 f"backend {backend.name!r} can't restore states, report contacts and render, which "

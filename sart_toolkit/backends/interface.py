@@ -6,7 +6,7 @@ import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from sart_toolkit.errors import MissingCapability
+from sart_toolkit.errors import InvalidInput, MissingCapability
 from sart_toolkit.poses import Array
 from sart_toolkit.records import DepthImage, Image
 from sart_toolkit.robots.spec import CameraSpec, RobotSpec
@@ -65,6 +65,17 @@ class Contact:
     penetration: float
 
 
+def check_size(image_size: int) -> int:
+    """`image_size` if it is a picture's width and height [pixels].
+
+    Raises:
+        InvalidInput: it is not positive.
+    """
+    if image_size < 1:
+        raise InvalidInput(f"image_size: expected at least 1 pixel, got {image_size}")
+    return image_size
+
+
 class Backend(abc.ABC):
     """A robot in its scene, stepped at 30 Hz: what every simulator and robot implements.
 
@@ -81,7 +92,7 @@ class Backend(abc.ABC):
     def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
         self.robot = robot
         self.scene = scene
-        self.image_size = image_size
+        self.image_size = check_size(image_size)
 
     @property
     def cameras(self) -> dict[str, CameraSpec]:

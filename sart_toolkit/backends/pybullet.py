@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import json
 import os
 import tempfile
@@ -20,6 +21,7 @@ from sart_toolkit.backends.interface import (
     Capabilities,
     Contact,
     Observation,
+    check_size,
 )
 from sart_toolkit.errors import BrokenFile, InvalidInput, unknown_name
 from sart_toolkit.poses import Array, check_array, inverse
@@ -52,7 +54,7 @@ with _without_greetings():
     from pybullet_utils.bullet_client import BulletClient
 
 _STEPS = PHYSICS_HZ // CONTROL_HZ
-_MAGIC = b"sart-pybullet-1\n"
+_MAGIC = b"sart-pybullet-2\n"
 # OpenGL's camera looks along -z with y up; ours looks along z with y down.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _JOINT_TOLERANCE = 1e-6
@@ -93,6 +95,11 @@ class PyBulletBackend(Backend):
         self._names |= {(self._robot, i): name for name, i in self._links.items()}
         self._touched: dict[tuple[str, str], tuple[float, float]] = {}
         self._time = 0.0
+        # Shapes and what is held, but not where bodies stand: that is part of a state.
+        what = [(b.name, b.shapes, b.mass, b.friction) for b in scene.bodies]
+        urdf = self._model.urdf.read_bytes()
+        with np.printoptions(precision=17, floatmode="unique", threshold=10**6):
+            self._scene_digest = hashlib.sha256(repr(what).encode() + urdf).hexdigest()
         n = len(robot.arm_joints)
         self._target = self._last_target = np.zeros(n + 1)
 
@@ -167,6 +174,7 @@ class PyBulletBackend(Backend):
     def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
         c = self._client
         known = self.cameras
+        size = self.image_size if image_size is None else check_size(image_size)
         for name in cameras:
             if name not in known:
                 raise unknown_name("camera", name, known)
@@ -183,9 +191,7 @@ class PyBulletBackend(Backend):
             gripper=c.getJointState(self._robot, self._driver)[0] / self.robot.gripper.closed_angle,
             T_world_tool=Ts[self.robot.tool_frame],
             time=self._time,
-            cameras={
-                name: self._picture(name, Ts, image_size or self.image_size) for name in cameras
-            },
+            cameras={name: self._picture(name, Ts, size) for name in cameras},
             Ts_world_body=Ts_body,
         )
 
@@ -203,7 +209,7 @@ class PyBulletBackend(Backend):
             size,
             size,
             view.T.ravel().tolist(),
-            p.computeProjectionMatrixFOV(camera.fov_y_deg, 1.0, near, far),
+            _projection(camera.fov_y_deg, near, far, size),
             shadow=0,
             lightDirection=[0.3, 0.4, 1.0],
             flags=p.ER_NO_SEGMENTATION_MASK,
@@ -212,7 +218,8 @@ class PyBulletBackend(Backend):
         rgb = np.asarray(rgb, np.uint8).reshape(size, size, 4)[:, :, :3]
         z = np.asarray(buffer, np.float64).reshape(size, size)
         depth = near * far / (far - (far - near) * z)
-        depth[z >= 1.0] = 0.0
+        # What nothing was drawn over keeps the buffer's far plane, give or take a rounding.
+        depth[depth >= far * (1 - 1e-4)] = 0.0
         return CameraView(np.ascontiguousarray(rgb), depth.astype(np.float32), T_world_camera)
 
     def command(self, q: Array, gripper: float) -> None:
@@ -237,15 +244,15 @@ class PyBulletBackend(Backend):
         c, robot = self._client, self._robot
         arm, n = self._arm, len(self._arm)
         ones = [1.0] * n
-        velocity = ((self._target - self._last_target)[:n] * CONTROL_HZ).tolist()
         gripper = self.robot.gripper
         self._touched = {}
         for i in range(1, _STEPS + 1):
             target = self._last_target + (i / _STEPS) * (self._target - self._last_target)
-            # Position gain 1 closes the whole error within one physics step and the velocity
-            # term carries the rest: the arm follows its targets as a stiff servo does.
+            # Position gain 1 closes the whole error within one physics step. A velocity target
+            # beside it would put the arm one physics step ahead of its targets.
             c.setJointMotorControlArray(
-                robot, arm, p.POSITION_CONTROL, target[:n].tolist(), velocity,
+                robot, arm, p.POSITION_CONTROL, target[:n].tolist(),
+                targetVelocities=[0.0] * n,
                 forces=self._forces, positionGains=ones, velocityGains=ones,
             )  # fmt: skip
             c.setJointMotorControl2(
@@ -284,26 +291,31 @@ class PyBulletBackend(Backend):
                 os.unlink(path)
         head = {
             "robot": self.robot.name,
+            "scene": self._scene_digest,
             "bodies": sorted(self._bodies),
             "target": self._target.tolist(),
             "last_target": self._last_target.tolist(),
             "time": self._time,
         }
-        return _MAGIC + json.dumps(head).encode() + b"\n" + zlib.compress(world, 1)
+        body = zlib.compress(json.dumps(head).encode() + b"\n" + world, 1)
+        return _MAGIC + hashlib.sha256(body).digest() + body
 
     def restore(self, state: bytes) -> None:
         try:
-            magic, head_line, packed = state.split(b"\n", 2)
-            if magic + b"\n" != _MAGIC:
+            if not state.startswith(_MAGIC):
                 raise ValueError("not a state of this backend")
+            sha, packed = state[len(_MAGIC) :][:32], state[len(_MAGIC) + 32 :]
+            if hashlib.sha256(packed).digest() != sha:
+                raise ValueError("damaged")
+            head_line, world = zlib.decompress(packed).split(b"\n", 1)
             head = json.loads(head_line)
-            world = zlib.decompress(packed)
         except (ValueError, zlib.error) as error:
             raise BrokenFile(f"saved state: {error}; record the demonstration again") from error
-        if head["robot"] != self.robot.name or head["bodies"] != sorted(self._bodies):
+        if head["scene"] != self._scene_digest:
             raise BrokenFile(
-                f"saved state is of robot {head['robot']!r} with {head['bodies']}, this backend "
-                f"has {self.robot.name!r} with {sorted(self._bodies)}; load the matching task"
+                f"saved state: of robot {head['robot']!r} with {head['bodies']}, this backend "
+                f"has {self.robot.name!r} with {sorted(self._bodies)} or other shapes; load the "
+                "matching task"
             )
         handle, path = tempfile.mkstemp(suffix=".bullet")
         try:
@@ -339,6 +351,17 @@ def _make_body(client: Any, body: Body) -> int:
     )
     client.changeDynamics(index, -1, lateralFriction=body.friction)
     return int(index)
+
+
+def _projection(fov_y_deg: float, near: float, far: float, size: int) -> list[float]:
+    """OpenGL's matrix, half a pixel off: TinyRenderer samples each pixel at its lower left corner.
+
+    So (0, 0) of the picture is the centre of its first pixel, as `CameraSpec.intrinsics` says.
+    """
+    matrix = list(p.computeProjectionMatrixFOV(fov_y_deg, 1.0, near, far))
+    matrix[8] += 1.0 / size
+    matrix[9] += 1.0 / size
+    return matrix
 
 
 def _arrays(shapes: Sequence[Shape], drawn: bool) -> dict[str, Any]:

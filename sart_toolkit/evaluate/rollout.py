@@ -100,7 +100,8 @@ def run_rollout(
         model: the robot's kinematics.
         placement: where the object stands.
         seed: (evaluation seed, episode), for the record.
-        watch: called at each 10 Hz step with the wrist picture, the step and success so far.
+        watch: called at the start and after each 10 Hz step with the wrist picture, the number of
+            steps done and whether the goal is reached.
     """
     state = task.initial_state(model, placement)
     backend.reset(state)
@@ -112,6 +113,8 @@ def run_rollout(
     reason = None
     step = 0
     observation = backend.observe((skill.config.camera,))
+    if watch is not None:
+        watch(observation.cameras[skill.config.camera].rgb, step, False)
     while step < round(task.horizon * RECORD_HZ):
         action = skill.act(observation.cameras[skill.config.camera].rgb, observation.gripper)
         desired, gripper = apply_action(controller.commanded_T_world_tool, action)
@@ -200,7 +203,6 @@ def evaluate_skill(
     """
     config = config or EvaluateConfig()
     skill = load_skill(skill_directory)
-    # Processes share the cores: a pool of threads in each would only make them wait.
     make_worker = functools.partial(
         _Worker,
         skill_directory,
@@ -208,17 +210,18 @@ def evaluate_skill(
         make_backend,
         config.eval_seed,
         device,
-        None if workers == 1 else 1,
     )
     started = time.perf_counter()
     rollouts: list[Rollout] = []
-    with worker_map(make_worker, workers) as run:
+    # Processes share the cores: a pool of threads in each would only make them wait.
+    threads = None if workers == 1 else 1
+    with worker_map(functools.partial(make_worker, threads), workers) as run:
         for rollout in run(range(config.episodes)):
             rollouts.append(rollout)
             if progress is not None:
                 progress(len(rollouts), config.episodes, sum(r.success for r in rollouts))
     seconds = time.perf_counter() - started
-    with closing(make_worker()) as worker:
+    with closing(make_worker(None)) as worker:
         result = _summary(rollouts, skill, task, worker.backend.name, config, seconds)
         if out is not None:
             result["videos"] = _videos(rollouts, worker, config, out.parent)

@@ -130,7 +130,9 @@ class PegInHole(Task):
         if beside >= 0.012:
             above = f"tip {tip[2] * 1e3:+.0f} mm from the rim"
             return f"peg {beside * 1e3:.0f} mm beside the hole's axis, {above}"
-        return f"peg over the hole but only {-tip[2] * 1e3:.0f} mm deep"
+        if tip[2] > 0:
+            return f"peg over the hole, tip {tip[2] * 1e3:.0f} mm above the rim"
+        return f"peg in the hole but only {-tip[2] * 1e3:.0f} mm deep"
 
     def plan(self, state: SceneState) -> list[Stage]:
         hole = state.Ts_world_body["block"]

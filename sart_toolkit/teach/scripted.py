@@ -39,6 +39,10 @@ class OperatorStyle:
     def __post_init__(self) -> None:
         for name in ("reaction", "approach", "creep", "tremor_time", "turn_deg"):
             check_positive(name, getattr(self, name))
+        for name in ("tremor", "tremor_deg", "hesitation", "rest"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InvalidInput(f"{name}: expected a finite number >= 0, got {value}")
 
 
 class ScriptedOperator(Device):

@@ -107,8 +107,8 @@ def record_demonstration(
     controller.reset(state.q)
     recorder = StepRecorder(backend, config.cameras)
     gripper = state.gripper
-    observation = recorder.add(controller, gripper, 0.0)
     can_save, feels = backend.capabilities.can_restore, backend.capabilities.has_contacts
+    observation = recorder.add(controller, gripper, 0.0 if feels else np.nan)
     states = [backend.save()] if can_save else []
     success, raw = [task.success(observation)], []
     stop = False
@@ -121,10 +121,12 @@ def record_demonstration(
         force = 0.0 if feels else np.nan
         for _ in range(CONTROL_PER_RECORD):
             now = backend.observe()
-            command = device.read(now)
-            stop = stop or command.stop
-            velocity = np.zeros(6) if stop else command.velocity
-            gripper = command.gripper
+            velocity = np.zeros(6)
+            if not stop:
+                command = device.read(now)
+                stop = command.stop
+                if not stop:
+                    velocity, gripper = command.velocity, command.gripper
             raw.append(np.append(velocity, gripper))
             desired = apply_motion(controller.commanded_T_world_tool, velocity / CONTROL_HZ)
             try:

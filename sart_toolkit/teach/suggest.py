@@ -46,8 +46,10 @@ class SuggestConfig:
     def __post_init__(self) -> None:
         for name in ("margin", "min_radius", "max_radius"):
             check_positive(name, getattr(self, name), "m")
-        if self.rotation_per_metre < 0:
-            raise InvalidInput(f"rotation_per_metre: expected >= 0, got {self.rotation_per_metre}")
+        if not (np.isfinite(self.rotation_per_metre) and self.rotation_per_metre >= 0):
+            raise InvalidInput(
+                f"rotation_per_metre: expected a finite number >= 0, got {self.rotation_per_metre}"
+            )
         if self.max_radius < self.min_radius:
             raise InvalidInput(
                 f"max_radius {self.max_radius} m is below min_radius {self.min_radius} m"
@@ -150,8 +152,8 @@ def _probe(
     config: SuggestConfig,
 ) -> str | None:
     """What goes wrong at one of the extreme poses of a radius, or None."""
-    # Sobol points of the four-dimensional square: direction of the offset, axis of the turn.
-    points = qmc.Sobol(4, scramble=False).random(config.probes)
+    # Halton points of the four-dimensional square: direction of the offset, axis of the turn.
+    points = qmc.Halton(4, scramble=False).random(config.probes)
     directions, axes = _sphere_points(points[:, :2]), _sphere_points(points[:, 2:])
     angle = config.rotation_per_metre * radius
     for direction, axis in zip(directions, axes, strict=True):
@@ -217,8 +219,10 @@ def suggest_annotation(
             progress(t)
         if found.radius < config.min_radius:
             return found, None
+        # Whole micrometres, rounded down: coal's last digits depend on what it computed before.
+        radius, clearance = (np.floor(x * 1e6) / 1e6 for x in (found.radius, found.clearance))
         return found, PrecisionSphere(
-            t, T_key, found.radius, "ball", "suggested", found.clearance, found.limited_by
+            t, T_key, float(radius), "ball", "suggested", float(clearance), found.limited_by
         )
 
     spheres = []
