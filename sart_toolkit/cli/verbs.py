@@ -230,8 +230,7 @@ def evaluate_verb(args: Evaluate) -> Result:
         result = evaluate_skill(
             args.skill, task, make, config, args.out, args.workers, args.device, progress
         )
-    short = {k: v for k, v in result.items() if k not in ("episodes", "versions", "config")}
-    return {"evaluation": str(args.out), **short}
+    return {"evaluation": str(args.out), **_without_rows(result)}
 
 
 def run_whole(args: Run) -> Result:
@@ -340,8 +339,7 @@ def info_verb(args: Info) -> Result:
                 ],
             }
         if "success_rate" in value:
-            rows = ("episodes", "versions", "config", "seeds", "videos")
-            return {"kind": "evaluation", **{k: v for k, v in value.items() if k not in rows}}
+            return {"kind": "evaluation", **_without_rows(value)}
         raise BrokenFile(f"{path}: neither an annotation nor an evaluation; pass another file")
     try:
         return {"kind": "demonstration", **_describe_demonstration(load_demonstration(path))}
@@ -402,6 +400,12 @@ def _describe_skill(path: Path) -> Result:
         "seconds": training["seconds"],
         "images_per_second": training["images_per_second"],
     }
+
+
+def _without_rows(evaluation: Result) -> Result:
+    """The figures of an evaluation, without what it lists for each episode."""
+    rows = ("episodes", "versions", "config", "seeds", "videos")
+    return {k: v for k, v in evaluation.items() if k not in rows}
 
 
 def _plain(record: Any) -> Result:

@@ -71,7 +71,7 @@ def test_success_does_not_depend_on_where_the_block_stands(x, y, z, tilt, about,
         ([0, 0, -0.03], 180, "peg tilted 180 deg"),
         ([0.06, 0.01, 0.03], 0, "peg 60 mm beside the hole's axis, tip +30 mm from the rim"),
         ([0, -0.09, -0.04], 0, "peg 90 mm beside the hole's axis, tip -40 mm from the rim"),
-        ([0, 0, -0.01], 0, "peg over the hole but only 10 mm deep"),
+        ([0, 0, -0.01], 0, "peg in the hole but only 10 mm deep"),
     ],
 )
 def test_a_shortfall_says_what_is_missing_in_millimetres_and_degrees(tip, tilt, text):
