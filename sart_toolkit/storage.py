@@ -134,6 +134,26 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
+def append_json_line(path: Path, value: Mapping[str, Any]) -> None:
+    """Add a JSON object as one line to the end of a file, made if needed.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    with _cannot_write(Path(path)), open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps(value) + "\n")
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """The JSON objects in a file of lines; none if it isn't there, a line that was cut left out."""
+    rows = []
+    if Path(path).exists():
+        for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
+            with contextlib.suppress(ValueError):
+                rows.append(json.loads(line))
+    return [row for row in rows if isinstance(row, dict)]
+
+
 def check_writable(path: Path, overwrite: bool = False) -> None:
     """Return if a stage may write `path` (a file or directory): absent, or to be overwritten.
 

@@ -42,6 +42,7 @@ from sart_toolkit.storage import (
     SCHEMA_VERSION,
     annotation_from_json,
     annotation_to_json,
+    append_json_line,
     check_writable,
     clear_directory,
     episode_name,
@@ -50,6 +51,7 @@ from sart_toolkit.storage import (
     load_demonstration,
     load_episode,
     read_json,
+    read_json_lines,
     remove,
     replacing,
     save_annotation,
@@ -814,3 +816,17 @@ def test_episode_names_sort_as_their_numbers_do():
     names = [episode_name(s, k) for s in (0, 3, 12) for k in (0, 9, 10, 12345)]
     assert names == sorted(names)
     assert len(set(names)) == len(names)
+
+
+def test_lines_are_added_one_by_one_and_a_cut_one_is_left_out(tmp_path):
+    path = tmp_path / "log.jsonl"
+    assert read_json_lines(path) == []
+    for k in range(3):
+        append_json_line(path, {"k": k})
+    path.write_bytes(path.read_bytes()[:-3])
+    assert read_json_lines(path) == [{"k": 0}, {"k": 1}]
+
+
+def test_a_line_that_the_disk_refuses_is_an_error_of_ours(tmp_path):
+    with pytest.raises(CannotWrite, match="log.jsonl: "):
+        append_json_line(tmp_path / "nowhere" / "log.jsonl", {"k": 0})

@@ -44,6 +44,7 @@ from sart_toolkit.records import (
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.storage import (
     annotation_to_json,
+    append_json_line,
     clear_directory,
     episode_name,
     load_annotation,
@@ -51,16 +52,19 @@ from sart_toolkit.storage import (
     load_demonstration,
     load_episode,
     read_json,
+    read_json_lines,
     save_annotation,
     save_demonstration,
     save_episode,
     write_json,
+    write_text,
 )
 from sart_toolkit.teach.recorder import StepRecorder
 from sart_toolkit.workers import worker_map
 
 _log = logging.getLogger(__name__)
 KEPT = "kept"
+_LOG = "attempts.jsonl"
 _LEAST_ATTEMPTS = 20
 _ATTEMPTS_PER_EPISODE = 10
 BackendFactory = Callable[[], Backend]
@@ -255,15 +259,12 @@ def augment_demonstration(
     quotas = [
         len(range(i, config.n - 1, len(annotation.spheres))) for i in range(len(annotation.spheres))
     ]
-    with (
-        open(out / "attempts.jsonl", "a") as log,
-        worker_map(functools.partial(_Worker, make_backend, out, config), workers) as run,
-    ):
+    with worker_map(functools.partial(_Worker, make_backend, out, config), workers) as run:
         while batch := _next_batch(outcomes, quotas):
             for sphere, k, outcome in run(batch):
                 outcomes[sphere, k] = outcome
-                log.write(json.dumps({"sphere": sphere, "k": k, "outcome": outcome}) + "\n")
-                log.flush()
+                row = {"sphere": sphere, "k": k, "outcome": outcome}
+                append_json_line(out / _LOG, row)
                 if progress is not None:
                     kept = sum(o == KEPT for o in outcomes.values())
                     progress(kept, config.n - 1, len(outcomes) - kept)
@@ -299,14 +300,7 @@ def _prepare(
 def _read_attempts(out: Path) -> dict[tuple[int, int], str]:
     """Outcomes noted before an interruption; a try whose line or file was cut is made again."""
     outcomes: dict[tuple[int, int], str] = {}
-    path = out / "attempts.jsonl"
-    if not path.exists():
-        return outcomes
-    for line in path.read_text().splitlines():
-        try:
-            row = json.loads(line)
-        except ValueError:
-            continue
+    for row in read_json_lines(out / _LOG):
         at = row["sphere"], row["k"]
         if row["outcome"] == KEPT:
             try:
@@ -314,10 +308,9 @@ def _read_attempts(out: Path) -> dict[tuple[int, int], str]:
             except (BrokenFile, FileNotFoundError):
                 continue
         outcomes[at] = row["outcome"]
-    lines = [
-        json.dumps({"sphere": s, "k": k, "outcome": o}) + "\n" for (s, k), o in outcomes.items()
-    ]
-    path.write_text("".join(lines))
+    # Written anew: a further line must not join one that was cut.
+    rows = [{"sphere": s, "k": k, "outcome": o} for (s, k), o in outcomes.items()]
+    write_text(out / _LOG, "".join(json.dumps(row) + "\n" for row in rows))
     return outcomes
 
 

@@ -32,9 +32,23 @@ def test_the_training_benchmark_ends_with_one_json_object(capsys):
     assert "compact_mlp step" in err and len(out.splitlines()) == 1
 
 
+def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
+    arguments = "augment --n 2 --image-size 16 --repeats 1"
+    assert bench.main(arguments.split()) == 0
+    out, err = capsys.readouterr()
+    figures = json.loads(out.splitlines()[-1])["figures"]
+    assert figures["kept"] == 1 and figures["attempted"] >= 1
+    # Each try simulates two seconds.
+    tries_per_second = figures["attempted"] * figures["kept_trajectories_per_second"]
+    assert figures["simulated_over_wall"] == pytest.approx(2 * tries_per_second)
+    assert "turn 1/1" in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["augment", "--repeats", "0"], "--repeats: expected a finite number > 0"),
+        (["augment", "--task", "peg"], "unknown task 'peg'"),
         (["trian"], "unknown benchmark 'trian': did you mean 'train'"),
         (["train", "--policy", "compact"], "unknown policy 'compact': did you mean 'compact_mlp'"),
         (["train", "--blocks", "0"], "--blocks: expected a finite number > 0"),
