@@ -57,7 +57,10 @@ def _cannot_write(path: Path) -> Iterator[None]:
             f"{path}: permission denied; choose another --out or mend its permissions"
         ) from error
     except OSError as error:
-        raise CannotWrite(f"{path}: {error.strerror or error}; nothing was replaced") from error
+        raise CannotWrite(
+            f"{path}: {error.strerror or error}; nothing was replaced, make "
+            "room or choose another --out"
+        ) from error
 
 
 @contextlib.contextmanager

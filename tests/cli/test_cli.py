@@ -97,6 +97,10 @@ def test_info_tells_each_kind_of_file(chain: Path, capsys: pytest.CaptureFixture
     main(["info", str(chain / "demo.h5")])
     assert "peg_in_hole" in capsys.readouterr().out
     assert "no run, skill or dataset" in error(capsys, "info", chain)
+    torn = chain / "torn.h5"
+    torn.write_bytes((chain / "demo.h5").read_bytes()[:1000])
+    assert "torn.h5: truncated" in error(capsys, "info", torn)
+    torn.unlink()
     assert "neither an annotation" in error(capsys, "info", chain / "data" / "dataset.json")
 
 
@@ -159,7 +163,7 @@ def test_poses_out_of_reach_are_counted_and_end_in_an_error(
     assert "none of 20 tries" in said and "out of reach: 1" in said and "smaller radii" in said
 
 
-def test_unknown_names_offer_the_nearest(
+def test_unknown_names_offer_the_nearest_and_leave_nothing(
     chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "x"
@@ -169,6 +173,8 @@ def test_unknown_names_offer_the_nearest(
     assert "did you mean 'pybullet'" in said
     said = error(capsys, "record", "peg_in_hole", "--out", out, "--robot", "ur5")
     assert "unknown robot 'ur5': did you mean 'ur5e_2f85'?" in said
+    said = error(capsys, "record", "peg_in_hole", "--out", out, "--image-size", 8)
+    assert "image_size: expected at least 16 pixels, got 8" in said
     said = error(capsys, "train", chain / "data", "--out", out, "--policy", "compact")
     assert "did you mean 'compact_mlp'" in said
     said = error(
