@@ -37,8 +37,9 @@ clean: ## remove .venv, caches and build products, but not runs/
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(VENV)/.setup: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || bash tools/setup_debian.sh core
+$(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
+	@groups=core; $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || groups="python core"; \
+	    bash tools/setup_debian.sh $$groups
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
 	    echo "sart_toolkit needs Python 3.11, but '$(PYTHON) --version' says:" \
 	        "$$($(PYTHON) --version 2>&1). Type: make $(MAKECMDGOALS)" \

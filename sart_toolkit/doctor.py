@@ -20,6 +20,9 @@ from pathlib import Path
 from sart_toolkit.errors import SartError
 
 DISK_NEEDED_GB = 2.0
+_ARM = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute">
+<parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
 _SUDO = "" if os.geteuid() == 0 else "sudo "
 
 
@@ -165,6 +168,28 @@ def _disk_finding(folder: Path) -> Finding:
     else:
         ok, detail, remedy = True, f"{free_gb:.1f} GB free in {folder}", ""
     return Finding("disk", ok, detail, remedy, required=True)
+
+
+def probe_kinematics() -> str:
+    """Versions of Pinocchio and coal, once each has computed something."""
+    import coal
+    import pinocchio
+
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
+        file.write(_ARM)
+        file.flush()
+        model = pinocchio.buildModelFromUrdf(file.name)
+    data = model.createData()
+    pinocchio.forwardKinematics(model, data, pinocchio.neutral(model))
+    apart = coal.Transform3s()
+    apart.setTranslation(data.oMi[1].translation + [2.0, 0.0, 0.0])
+    distance = coal.distance(
+        coal.Sphere(0.5), coal.Transform3s(), coal.Sphere(0.5), apart,
+        coal.DistanceRequest(), coal.DistanceResult(),
+    )  # fmt: skip
+    if abs(distance - 1.0) > 1e-6:
+        raise ProbeFailed(f"two spheres 1 m apart are {distance:.3f} m apart")
+    return f"{_version('pin')}, {_version('coal')}, compute"
 
 
 def probe_pybullet() -> str:
@@ -354,6 +379,12 @@ def _version(*packages: str) -> str:
 _REINSTALL = "reinstall: pip install --force-reinstall sart_toolkit, or: make clean setup"
 
 PROBES: Sequence[Probe] = (
+    Probe(
+        "kinematics",
+        "sart_toolkit.doctor:probe_kinematics",
+        remedy=f"in a checkout: {_SUDO}bash tools/setup_debian.sh core, or reinstall both",
+        required=True,
+    ),
     Probe("PyBullet", "sart_toolkit.doctor:probe_pybullet", remedy=_REINSTALL, required=True),
     Probe("ffmpeg", "sart_toolkit.doctor:probe_ffmpeg", remedy=_REINSTALL, required=True),
     Probe(

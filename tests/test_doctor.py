@@ -31,6 +31,7 @@ def made_up_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_everything_is_looked_at(findings: list[Finding]) -> None:
     assert {finding.name for finding in findings} == {
         "Python",
+        "kinematics",
         "PyBullet",
         "SAPIEN physics",
         "SAPIEN rendering",
@@ -52,7 +53,7 @@ def test_every_finding_has_a_detail_and_a_broken_one_a_remedy(findings: list[Fin
 def test_what_the_tests_run_on_works_and_comes_first(findings: list[Finding]) -> None:
     required = [finding for finding in findings if finding.required]
     assert findings[: len(required)] == required
-    assert {f.name for f in required} == {"Python", "disk", "PyBullet", "ffmpeg"}
+    assert {f.name for f in required} == {"Python", "disk", "kinematics", "PyBullet", "ffmpeg"}
     assert [finding for finding in required if not finding.ok] == []
 
 

@@ -3,17 +3,19 @@
 # than root it prints the command to type instead, and exits with 1. On another system it only
 # names the packages.
 #
-# Usage: bash tools/setup_debian.sh GROUP...      groups: core sapien annotate
+# Usage: bash tools/setup_debian.sh GROUP...      groups: python core sapien annotate
 set -euo pipefail
 
 usage() {
-    echo "usage: bash tools/setup_debian.sh GROUP... (groups: core sapien annotate)" >&2
+    echo "usage: bash tools/setup_debian.sh GROUP... (groups: python core sapien annotate)" >&2
     exit 2
 }
 
 packages_of() {
     case "$1" in
-        core) echo "python3 python3-venv" ;;
+        python) echo "python3 python3-venv" ;;
+        # Pinocchio's wheel expects it.
+        core) echo "libgomp1" ;;
         # SAPIEN draws without a GPU from this Mesa on; Debian 12 has it in its backports only.
         sapien) echo "libvulkan1 mesa-vulkan-drivers>=24.3" ;;
         # Open3D draws through Vulkan, and any Mesa will do.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from sart_toolkit.cli.arguments import Verb
+from sart_toolkit.cli.arguments import Doctor, Verb
 from sart_toolkit.cli.console import say
 from sart_toolkit.errors import SartError
 
@@ -25,13 +25,21 @@ def main(argv: Sequence[str] | None = None) -> None:
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     logging.basicConfig(level=logging.WARNING, format="sart: %(message)s")
-    # The verbs pull in torch and the simulator; help and typing mistakes should not wait for them.
-    from sart_toolkit.cli.verbs import run_verb
-
     try:
-        run_verb(verb)
+        # The verbs pull in torch and the simulator; help and mistakes should not wait for them.
+        if isinstance(verb, Doctor):
+            from sart_toolkit.cli.doctor import run_doctor
+
+            run_doctor(verb)
+        else:
+            from sart_toolkit.cli.verbs import run_verb
+
+            run_verb(verb)
     except SartError as error:
         say(f"sart: error: {error}")
+        sys.exit(2)
+    except ImportError as error:
+        say(f"sart: error: {error}; `sart doctor` tells what is missing and how to mend it")
         sys.exit(2)
     except KeyboardInterrupt:
         say("sart: interrupted; finished parts are kept, type the same command again to go on")

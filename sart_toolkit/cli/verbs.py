@@ -21,7 +21,6 @@ from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.cli.arguments import (
     Augment,
-    Doctor,
     Evaluate,
     Info,
     Record,
@@ -61,10 +60,7 @@ Result = dict[str, Any]
 
 def run_verb(verb: Any) -> None:
     """Carry out a parsed command and print its result."""
-    result = _VERBS[type(verb)](verb)
-    show(result, verb.json)
-    if result.get("usable") is False:
-        sys.exit(1)
+    show(_VERBS[type(verb)](verb), verb.json)
 
 
 def _backend_factory(
@@ -350,21 +346,6 @@ def info_verb(args: Info) -> Result:
     return {"kind": "episode", "steps": len(episode), **_plain(episode.provenance)}
 
 
-def doctor_verb(args: Doctor) -> Result:
-    """`sart doctor`: findings to read, or as data."""
-    findings = doctor.diagnose()
-    usable = all(finding.ok for finding in findings if finding.required)
-    if args.json:
-        rows = [dataclasses.asdict(finding) for finding in findings]
-        return {"usable": usable, "findings": rows}
-    lines: Result = {"usable": usable}
-    for finding in findings:
-        mark = "ok  " if finding.ok else ("FAIL" if finding.required else "off ")
-        remedy = f"\n      -> {finding.remedy}" if finding.remedy and not finding.ok else ""
-        lines[f"{mark} {finding.name}"] = f"{finding.detail}{remedy}"
-    return lines
-
-
 def _describe_demonstration(demonstration: Demonstration) -> Result:
     d = demonstration
     return {
@@ -426,5 +407,4 @@ _VERBS: dict[type, Callable[[Any], Result]] = {
     Train: train_verb,
     Evaluate: evaluate_verb,
     Info: info_verb,
-    Doctor: doctor_verb,
 }

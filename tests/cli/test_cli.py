@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from sart_toolkit.cli import main
+from sart_toolkit.doctor import Finding
 from sart_toolkit.evaluate.report import write_report
 from sart_toolkit.storage import load_demonstration
 
@@ -274,3 +276,24 @@ def test_placement_can_be_random(tmp_path: Path, capsys: pytest.CaptureFixture[s
     placement = load_demonstration(out).task_parameters["placement"]
     assert said["placement"] == placement
     assert placement["x"] != 0.0 and abs(placement["x"]) <= 0.05
+
+
+def test_a_library_that_does_not_load_leads_to_the_doctor_who_needs_none(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("sart_toolkit.cli.verbs", "pinocchio"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert "`sart doctor` tells what is missing" in error(capsys, "info", "x")
+
+    broken = Finding("kinematics", False, "libgomp.so.1 is missing", "install it", required=True)
+    monkeypatch.setattr("sart_toolkit.doctor.diagnose", lambda: [broken])
+    with pytest.raises(SystemExit) as exit_:
+        main(["doctor"])
+    assert exit_.value.code == 1
+    assert (
+        "FAIL kinematics  libgomp.so.1 is missing\n      -> install it" in capsys.readouterr().out
+    )
+    with pytest.raises(SystemExit):
+        main(["doctor", "--json"])
+    said = json.loads(capsys.readouterr().out)
+    assert said["usable"] is False and said["findings"][0]["remedy"] == "install it"

@@ -1,0 +1,28 @@
+"""`sart doctor`, apart from the other verbs: it has to work where what they import does not."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from typing import Any
+
+from sart_toolkit import doctor
+from sart_toolkit.cli.arguments import Doctor
+from sart_toolkit.cli.console import show
+
+
+def run_doctor(args: Doctor) -> None:
+    """Print the findings, and exit with 1 where something required does not work."""
+    findings = doctor.diagnose()
+    usable = all(finding.ok for finding in findings if finding.required)
+    result: dict[str, Any] = {"usable": usable}
+    if args.json:
+        result["findings"] = [dataclasses.asdict(finding) for finding in findings]
+    else:
+        for finding in findings:
+            mark = "ok  " if finding.ok else ("FAIL" if finding.required else "off ")
+            remedy = f"\n      -> {finding.remedy}" if finding.remedy and not finding.ok else ""
+            result[f"{mark} {finding.name}"] = f"{finding.detail}{remedy}"
+    show(result, args.json)
+    if not usable:
+        sys.exit(1)
