@@ -67,7 +67,17 @@ def apply_action(T_world_tool: Array, action: Array) -> tuple[Array, float]:
 def library_versions() -> dict[str, str]:
     """Versions of Python, the toolkit and the libraries that results depend on."""
     versions = {"python": platform.python_version()}
-    for name in ("sart_toolkit", "numpy", "pin", "coal", "ruckig", "pybullet", "torch", "h5py"):
+    for name in (
+        "sart_toolkit",
+        "numpy",
+        "pin",
+        "coal",
+        "ruckig",
+        "pybullet",
+        "torch",
+        "safetensors",
+        "h5py",
+    ):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     return versions

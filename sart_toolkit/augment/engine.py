@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.augment.strategies import SamplingConfig, get_strategy
-from sart_toolkit.backends.interface import Backend
+from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.errors import (
     BrokenFile,
     InvalidInput,
@@ -67,7 +67,6 @@ KEPT = "kept"
 _LOG = "attempts.jsonl"
 _LEAST_ATTEMPTS = 20
 _ATTEMPTS_PER_EPISODE = 10
-BackendFactory = Callable[[], Backend]
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sart_toolkit.errors import InvalidInput, MissingCapability
@@ -163,3 +163,7 @@ class Backend(abc.ABC):
 
     def _lacks(self, what: str) -> MissingCapability:
         return MissingCapability(f"backend {self.name!r} can't {what}; use another backend")
+
+
+# Makes a robot in its scene; picklable where it goes to other processes.
+BackendFactory = Callable[[], Backend]

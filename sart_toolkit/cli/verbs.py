@@ -18,7 +18,7 @@ from sart_toolkit import doctor
 from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
 from sart_toolkit.augment.strategies import SamplingConfig
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.backends.interface import Backend
+from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.cli.arguments import (
     Augment,
     Evaluate,
@@ -63,9 +63,7 @@ def run_verb(verb: Any) -> None:
     show(_VERBS[type(verb)](verb), verb.json)
 
 
-def _backend_factory(
-    name: str, task: Task, robot: str | None, image_size: int
-) -> Callable[[], Backend]:
+def _backend_factory(name: str, task: Task, robot: str | None, image_size: int) -> BackendFactory:
     if name not in BACKENDS:
         raise unknown_name("backend", name, BACKENDS)
     if image_size < 16:
@@ -275,7 +273,7 @@ def run_whole(args: Run) -> Result:
         ))),
         ("evaluate", evaluation, lambda: evaluate_verb(Evaluate(
             skill, evaluation, episodes=args.episodes, eval_seed=args.eval_seed,
-            workers=args.workers,
+            workers=args.workers, device=args.device,
         ))),
     ]  # fmt: skip
     for name, result, carry_out in steps:

@@ -13,7 +13,7 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from sart_toolkit.backends.interface import Backend
+from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.evaluate.video import Outcome, caption, inset, write_video
@@ -31,7 +31,6 @@ from sart_toolkit.storage import write_json
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.workers import worker_map
 
-BackendFactory = Callable[[], Backend]
 _OVERVIEW, _VIDEO_SIZE = "overview", 384
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,9 +25,13 @@ from sart_toolkit.learn.training import (
 )
 from sart_toolkit.learn.windows import resize_area
 from sart_toolkit.poses import Array, check_array, check_pose, frozen
-from sart_toolkit.records import Annotation, Dataset, Demonstration, Image
-
-_VERSIONS_OF = ("sart_toolkit", "torch", "numpy", "safetensors", "h5py")
+from sart_toolkit.records import (
+    Annotation,
+    Dataset,
+    Demonstration,
+    Image,
+    library_versions,
+)
 
 
 @dataclass(frozen=True)
@@ -195,7 +198,7 @@ def save_skill(
             "device": result.device,
             "bfloat16": result.bfloat16,
             "config": result.config.to_json(),
-            "versions": _versions(),
+            "versions": library_versions(),
         },
     )
     save_tensors(
@@ -253,13 +256,3 @@ def load_skill(path: Path, device: str = "cpu") -> Skill:
             f"({str(error).splitlines()[-1].strip()}); copy the whole skill directory again"
         ) from error
     return Skill(policy, config, demonstration, annotation, training, device)
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for name in _VERSIONS_OF:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions

@@ -113,7 +113,7 @@ def record_demonstration(
     success, raw = [task.success(observation)], []
     stop = False
     while not stop:
-        if len(states or success) > config.max_seconds * RECORD_HZ:
+        if len(success) > config.max_seconds * RECORD_HZ:
             raise InvalidInput(
                 f"the demonstration did not end within {config.max_seconds:.0f} s: "
                 f"{task.shortfall(observation)}; steer on, or allow more with max_seconds"
@@ -128,13 +128,7 @@ def record_demonstration(
                 if not stop:
                     velocity, gripper = command.velocity, command.gripper
             raw.append(np.append(velocity, gripper))
-            desired = apply_motion(controller.commanded_T_world_tool, velocity / CONTROL_HZ)
-            try:
-                q = controller.move(desired, now.T_world_tool, 1)[0]
-            except (Unreachable, MotionRejected) as error:
-                _log.warning("command not carried out: %s", error)
-                q = controller.commanded_q
-            backend.command(q, gripper)
+            backend.command(_steered(controller, velocity, now.T_world_tool), gripper)
             backend.step()
             if feels:
                 force = max([force, *(contact.force for contact in backend.contacts())])
@@ -166,3 +160,13 @@ def record_demonstration(
         seed=seed,
         versions=library_versions(),
     )
+
+
+def _steered(controller: ToolController, velocity: Array, measured_T_world_tool: Array) -> Array:
+    """Joint targets `(n,)` after one control period of a tool velocity; where it can't go, stay."""
+    desired = apply_motion(controller.commanded_T_world_tool, velocity / CONTROL_HZ)
+    try:
+        return controller.move(desired, measured_T_world_tool, 1)[0]
+    except (Unreachable, MotionRejected) as error:
+        _log.warning("command not carried out: %s", error)
+        return controller.commanded_q

@@ -119,8 +119,10 @@ def suggest_radius(
         Ts_world_body: where the scene's bodies were.
         config: margins and limits.
     """
-    best = Suggestion(config.max_radius, np.inf, "max_radius")
-    for i, pair in clearances.tool_distances(q, Ts_world_body).items():
+    pairs = clearances.tool_distances(q, Ts_world_body)
+    nearest = min(pair.distance for pair in pairs.values())
+    best = Suggestion(config.max_radius, nearest, "max_radius")
+    for i, pair in pairs.items():
         r = certified_radius(
             pair.distance,
             clearances.tool_reach[i],
@@ -130,11 +132,6 @@ def suggest_radius(
         )
         if r < best.radius:
             best = Suggestion(r, pair.distance, f"{pair.a} / {pair.b}")
-    if not np.isfinite(best.clearance):
-        nearest = min(
-            clearances.tool_distances(q, Ts_world_body).values(), key=lambda pair: pair.distance
-        )
-        best = Suggestion(best.radius, nearest.distance, best.limited_by)
     while best.radius >= config.min_radius:
         problem = _probe(clearances, q, T_world_key, Ts_world_body, best.radius, config)
         if problem is None:

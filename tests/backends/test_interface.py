@@ -453,9 +453,11 @@ def test_an_unknown_camera_is_refused_with_the_nearest_name(bench):
 
 
 def test_closing_twice_does_nothing(another):
-    backend = another(16).backend
-    backend.close()
-    backend.close()
+    made, kept = another(16), another(16)
+    made.backend.close()
+    made.backend.close()
+    # Neither call reached the simulator of somebody else.
+    assert np.isfinite(kept.backend.observe().T_world_tool).all()
 
 
 def test_what_a_backend_cannot_do_raises_instead_of_doing_nothing(bench):

@@ -283,8 +283,9 @@ def test_a_checkpoint_of_other_options_is_refused(dataset, small_config, tmp_pat
 
 
 def test_a_checkpoint_may_go_on_with_other_threads(dataset, small_config, tmp_path):
-    train(dataset, small_config, tmp_path)
-    train(dataset, dataclasses.replace(small_config, threads=2), tmp_path)
+    before = train(dataset, small_config, tmp_path)
+    after = train(dataset, dataclasses.replace(small_config, threads=2), tmp_path)
+    assert after.curve == before.curve
 
 
 def test_a_checkpoint_of_another_dataset_is_refused(make_dataset, small_config, tmp_path):

@@ -198,7 +198,8 @@ def test_any_number_of_probes_works_without_a_warning(
     peg_task, peg_model, peg_demonstration, probes
 ):
     config = SuggestConfig(probes=probes)
-    suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [0], config)
+    annotation = suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [0], config)
+    assert annotation.spheres[0].radius > peg_task.placement_range
 
 
 @pytest.mark.parametrize("waypoint", [-1, 10_000])
