@@ -6,7 +6,7 @@ import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from sart_toolkit.errors import InvalidInput, MissingCapability
+from sart_toolkit.errors import InvalidInput, MissingCapability, unknown_name
 from sart_toolkit.poses import Array
 from sart_toolkit.records import DepthImage, Image
 from sart_toolkit.robots.spec import CameraSpec, RobotSpec
@@ -15,12 +15,18 @@ from sart_toolkit.scene.spec import SceneSpec, SceneState
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a backend can do; asking for more raises `MissingCapability`, nothing is silent."""
+    """What a backend can do; asking for more raises `MissingCapability`, nothing is silent.
+
+    `drift` [m] and `drift_deg`: how far robot and resting bodies may be, a second after a restore,
+    from where they would have been without; 0 where it makes no difference at all.
+    """
 
     can_restore: bool
     has_contacts: bool
     renders: bool
     observes_bodies: bool
+    drift: float = 1e-3
+    drift_deg: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -56,13 +62,25 @@ class Observation:
 class Contact:
     """Two bodies that touched during the last control period, at any of its physics steps.
 
-    `a`, `b`: link or body names; `force` [N]: greatest normal force; `penetration` [m] >= 0.
+    `a`, `b`: link or body names, in alphabetical order; `force` [N]: greatest normal force;
+    `penetration` [m] >= 0.
     """
 
     a: str
     b: str
     force: float
     penetration: float
+
+
+def check_gripper(gripper: float) -> float:
+    """`gripper` if it is a command in [0, 1].
+
+    Raises:
+        InvalidInput: it is not.
+    """
+    if not 0.0 <= gripper <= 1.0:
+        raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {gripper}")
+    return float(gripper)
 
 
 def check_size(image_size: int) -> int:
@@ -99,12 +117,21 @@ class Backend(abc.ABC):
         """The cameras by name: the robot's wrist camera and the scene's."""
         return {c.name: c for c in (self.robot.wrist_camera, *self.scene.cameras)}
 
+    def _check_cameras(self, names: Sequence[str]) -> None:
+        known = self.cameras
+        for name in names:
+            if name not in known:
+                raise unknown_name("camera", name, known)
+
     @abc.abstractmethod
     def reset(self, state: SceneState) -> None:
         """Put robot and bodies at rest in a state; time becomes 0.
 
+        The joint targets become the state's own, the gripper's target its `commanded_gripper`.
+
         Raises:
-            InvalidInput: joints of the wrong number or outside their limits.
+            InvalidInput: joints of the wrong number or outside their limits, or a body that isn't
+                where its joint has it.
             UnknownName: the state has a body that the scene hasn't, or lacks one.
         """
 
@@ -151,7 +178,11 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def contacts(self) -> list[Contact]:
-        """Which bodies touched during the last `step`, scene against scene left out.
+        """Which bodies touched during the last `step`, in order of their names.
+
+        Every pair with a robot link, a held body or a scene body that can move counts. Left out are
+        pairs that never move, links of the robot that neighbour each other, and a body with a joint
+        against the one that it moves on. None have touched after `reset` or `restore`.
 
         Raises:
             MissingCapability: `has_contacts` is false.

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import json
 import os
 import tempfile
-import zlib
-from collections.abc import Iterator, Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -21,14 +19,17 @@ from sart_toolkit.backends.interface import (
     Capabilities,
     Contact,
     Observation,
+    check_gripper,
     check_size,
 )
-from sart_toolkit.errors import BrokenFile, InvalidInput, unknown_name
-from sart_toolkit.poses import Array, check_array, inverse
+from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
+from sart_toolkit.errors import BrokenFile
+from sart_toolkit.poses import Array, inverse
 from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec, Shape
-from sart_toolkit.scene.spec import Body, SceneSpec, SceneState
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.robots.urdf import add_joint, rigid_link
+from sart_toolkit.scene.spec import Body, Joint, SceneSpec, SceneState
 
 
 @contextmanager
@@ -54,10 +55,8 @@ with _without_greetings():
     from pybullet_utils.bullet_client import BulletClient
 
 _STEPS = PHYSICS_HZ // CONTROL_HZ
-_MAGIC = b"sart-pybullet-2\n"
 # OpenGL's camera looks along -z with y up; ours looks along z with y down.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-_JOINT_TOLERANCE = 1e-6
 
 
 class PyBulletBackend(Backend):
@@ -65,12 +64,18 @@ class PyBulletBackend(Backend):
 
     Between two commands the joint targets move linearly at 240 Hz, so that the motion is as smooth
     as an arm's own interpolator makes it. The gripper's linkage follows its driver through gear
-    constraints. Arm and tool may collide with each other; neighbouring links may not.
+    constraints. Arm and tool may collide with each other; neighbouring links may not. The friction
+    between two bodies is the product of their coefficients.
     """
 
     name = "pybullet"
     capabilities = Capabilities(
-        can_restore=True, has_contacts=True, renders=True, observes_bodies=True
+        can_restore=True,
+        has_contacts=True,
+        renders=True,
+        observes_bodies=True,
+        drift=0.0,
+        drift_deg=0.0,
     )
 
     def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
@@ -84,24 +89,53 @@ class PyBulletBackend(Backend):
         c.setGravity(*scene.gravity)
         c.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         self._load_robot()
-        self._bodies: dict[str, int] = {}
+        # Where each body is: its multibody, and its link there (-1: the base).
+        self._bodies: dict[str, tuple[int, int]] = {}
+        self._springs: list[tuple[int, int, Joint]] = []
         for body in scene.bodies:
-            index = self._bodies[body.name] = _make_body(c, body)
-            if body.mass is None:
-                # The arm stands on the table: what neither of them moves can't collide.
-                for link in self._base_links:
-                    c.setCollisionFilterPair(self._robot, index, link, -1, 0)
-        self._names = {(i, -1): name for name, i in self._bodies.items()}
+            if body.joint is None:
+                self._load_bodies(body)
+        still = {self._bodies[body.name] for body in scene.bodies if body.mass is None}
+        still |= {(self._robot, link) for link in self._base_links}
+        for a in still:
+            for b in still:
+                # The arm stands on the table: what never moves can't collide.
+                c.setCollisionFilterPair(a[0], b[0], a[1], b[1], 0)
+        self._names = {at: name for name, at in self._bodies.items()}
         self._names |= {(self._robot, i): name for name, i in self._links.items()}
         self._touched: dict[tuple[str, str], tuple[float, float]] = {}
         self._time = 0.0
-        # Shapes and what is held, but not where bodies stand: that is part of a state.
-        what = [(b.name, b.shapes, b.mass, b.friction) for b in scene.bodies]
-        urdf = self._model.urdf.read_bytes()
-        with np.printoptions(precision=17, floatmode="unique", threshold=10**6):
-            self._scene_digest = hashlib.sha256(repr(what).encode() + urdf).hexdigest()
+        self._scene_digest = scene_digest(self._model, scene)
         n = len(robot.arm_joints)
         self._target = self._last_target = np.zeros(n + 1)
+
+    def _load_bodies(self, root: Body) -> None:
+        """Load a body and those that move on it as one multibody."""
+        c = self._client
+        moving = {b.name: b for b in self.scene.bodies if b.joint and b.joint.parent == root.name}
+        with _urdf_file(root, moving.values()) as path:
+            index = c.loadURDF(
+                path, useFixedBase=root.mass is None, flags=p.URDF_USE_INERTIA_FROM_FILE
+            )
+        self._bodies[root.name] = index, -1
+        for link in range(c.getNumJoints(index)):
+            body = moving[c.getJointInfo(index, link)[12].decode()]
+            assert body.joint is not None
+            self._bodies[body.name] = index, link
+            if body.joint.stiffness or body.joint.detent:
+                self._springs.append((index, link, body.joint))
+            # A motor that wants to stand still, of limited strength, is dry friction.
+            c.setJointMotorControl2(
+                index, link, p.VELOCITY_CONTROL, targetVelocity=0.0, force=body.joint.friction
+            )
+        for body in (root, *moving.values()):
+            c.changeDynamics(
+                *self._bodies[body.name],
+                lateralFriction=body.friction,
+                linearDamping=0,
+                angularDamping=0,
+                jointDamping=0,
+            )
 
     def _load_robot(self) -> None:
         c, robot = self._client, self.robot
@@ -119,6 +153,7 @@ class PyBulletBackend(Backend):
             parents[i] = info[16]
             c.changeDynamics(self._robot, i, linearDamping=0, angularDamping=0, jointDamping=0)
         self._arm = [joints[name] for name in robot.arm_joints]
+        self._gripper = {name: joints[name] for name in robot.gripper.joint_positions(0.0)}
         self._driver = joints[robot.gripper.driver]
         self._followers = {joints[n]: ratio for n, ratio in robot.gripper.followers.items()}
         self._tool_link = self._links[robot.tool_frame]
@@ -151,20 +186,21 @@ class PyBulletBackend(Backend):
                     c.setCollisionFilterPair(self._robot, self._robot, a, b, 0)
 
     def reset(self, state: SceneState) -> None:
-        q = self._check_q(state.q)
-        if set(state.Ts_world_body) != set(self._bodies):
-            odd = sorted(set(state.Ts_world_body) ^ set(self._bodies))
-            raise unknown_name("body in the state to reset to", odd[0], self._bodies)
+        q = self._model.check_limits(state.q)
+        self.scene.check_state(state)
         c = self._client
         for joint, angle in zip(self._arm, q, strict=True):
             c.resetJointState(self._robot, joint, angle)
-        angle = self.robot.gripper.closed_angle * state.gripper
-        for joint, ratio in {self._driver: 1.0, **self._followers}.items():
-            c.resetJointState(self._robot, joint, angle * ratio)
-        for name, T in state.Ts_world_body.items():
-            c.resetBasePositionAndOrientation(self._bodies[name], T[:3, 3], _quaternion(T))
-            c.resetBaseVelocity(self._bodies[name], [0, 0, 0], [0, 0, 0])
-        self._target = self._last_target = np.append(q, state.gripper)
+        for name, position in self.robot.gripper.joint_positions(state.gripper).items():
+            c.resetJointState(self._robot, self._gripper[name], position)
+        for name, (index, link) in self._bodies.items():
+            if link >= 0:
+                c.resetJointState(index, link, state.joint_positions[name])
+                continue
+            T = state.Ts_world_body[name] @ self._T_body_centre(index)
+            c.resetBasePositionAndOrientation(index, T[:3, 3], _quaternion(T))
+            c.resetBaseVelocity(index, [0, 0, 0], [0, 0, 0])
+        self._target = self._last_target = np.append(q, state.commanded_gripper)
         self._time = 0.0
         self._touched = {}
         # A restore from the file that this state saves to also drops what the solver remembers of
@@ -175,35 +211,43 @@ class PyBulletBackend(Backend):
         c = self._client
         known = self.cameras
         size = self.image_size if image_size is None else check_size(image_size)
-        for name in cameras:
-            if name not in known:
-                raise unknown_name("camera", name, known)
+        self._check_cameras(cameras)
         states = c.getJointStates(self._robot, self._arm)
+        closed = self.robot.gripper.closed_position
         frames = {known[name].frame for name in cameras} - {"world"}
         frames |= {self.robot.tool_frame, *(body.name for body in self.scene.held)}
-        Ts = {name: self._link_pose(name) for name in frames}
+        Ts = {name: self._link_pose(self._robot, self._links[name]) for name in frames}
         Ts_body = {body.name: Ts[body.name] for body in self.scene.held}
-        for name, body in self._bodies.items():
-            Ts_body[name] = _matrix(*c.getBasePositionAndOrientation(body))
+        for name, (index, link) in self._bodies.items():
+            if link >= 0:
+                Ts_body[name] = self._link_pose(index, link)
+            else:
+                T_world_centre = _matrix(*c.getBasePositionAndOrientation(index))
+                Ts_body[name] = T_world_centre @ inverse(self._T_body_centre(index))
         return Observation(
             q=np.array([s[0] for s in states]),
             dq=np.array([s[1] for s in states]),
-            gripper=c.getJointState(self._robot, self._driver)[0] / self.robot.gripper.closed_angle,
+            gripper=c.getJointState(self._robot, self._driver)[0] / closed,
             T_world_tool=Ts[self.robot.tool_frame],
             time=self._time,
             cameras={name: self._picture(name, Ts, size) for name in cameras},
             Ts_world_body=Ts_body,
         )
 
-    def _link_pose(self, name: str) -> Array:
-        state = self._client.getLinkState(self._robot, self._links[name], 0, 1)
+    def _link_pose(self, index: int, link: int) -> Array:
+        state = self._client.getLinkState(index, link, 0, 1)
         return _matrix(state[4], state[5])
+
+    def _T_body_centre(self, index: int) -> Array:
+        """PyBullet's base is a body's centre of mass with its principal axes."""
+        dynamics = self._client.getDynamicsInfo(index, -1)
+        return _matrix(dynamics[3], dynamics[4])
 
     def _picture(self, name: str, Ts_world_frame: dict[str, Array], size: int) -> CameraView:
         camera = self.cameras[name]
         T = np.eye(4) if camera.frame == "world" else Ts_world_frame[camera.frame]
         T_world_camera = T @ camera.T_frame_camera
-        near, far = camera.near, camera.far
+        near, far, light = camera.near, camera.far, self.scene.light
         view = inverse(T_world_camera @ _FLIP)
         _, _, rgb, buffer, _ = self._client.getCameraImage(
             size,
@@ -211,7 +255,9 @@ class PyBulletBackend(Backend):
             view.T.ravel().tolist(),
             _projection(camera.fov_y_deg, near, far, size),
             shadow=0,
-            lightDirection=[0.3, 0.4, 1.0],
+            lightDirection=light.direction.tolist(),
+            lightAmbientCoeff=light.ambient,
+            lightDiffuseCoeff=light.intensity,
             flags=p.ER_NO_SEGMENTATION_MASK,
             renderer=p.ER_TINY_RENDERER,
         )
@@ -223,22 +269,7 @@ class PyBulletBackend(Backend):
         return CameraView(np.ascontiguousarray(rgb), depth.astype(np.float32), T_world_camera)
 
     def command(self, q: Array, gripper: float) -> None:
-        if not 0.0 <= gripper <= 1.0:
-            raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {gripper}")
-        self._target = np.append(self._check_q(q), gripper)
-
-    def _check_q(self, q: Array) -> Array:
-        q = check_array("q", q, (len(self._arm),))
-        over = (q < self._model.lower - _JOINT_TOLERANCE) | (
-            q > self._model.upper + _JOINT_TOLERANCE
-        )
-        if over.any():
-            j = int(np.argmax(over))
-            raise InvalidInput(
-                f"{self.robot.arm_joints[j]}: {q[j]:.3f} rad is outside its limits "
-                f"[{self._model.lower[j]:.3f}, {self._model.upper[j]:.3f}]"
-            )
-        return q
+        self._target = np.append(self._model.check_limits(q), check_gripper(gripper))
 
     def step(self) -> None:
         c, robot = self._client, self._robot
@@ -256,9 +287,12 @@ class PyBulletBackend(Backend):
                 forces=self._forces, positionGains=ones, velocityGains=ones,
             )  # fmt: skip
             c.setJointMotorControl2(
-                robot, self._driver, p.POSITION_CONTROL, gripper.closed_angle * target[n],
+                robot, self._driver, p.POSITION_CONTROL, gripper.closed_position * target[n],
                 force=gripper.force, maxVelocity=gripper.speed,
             )  # fmt: skip
+            for index, link, joint in self._springs:
+                effort = joint.effort(c.getJointState(index, link)[0])
+                c.setJointMotorControl2(index, link, p.TORQUE_CONTROL, force=effort)
             c.stepSimulation()
             self._collect_contacts()
         self._last_target = self._target
@@ -268,8 +302,6 @@ class PyBulletBackend(Backend):
         for point in self._client.getContactPoints():
             distance, force = point[8], point[9]
             if distance > 0.0 and force <= 0.0:
-                continue
-            if self._robot not in (point[1], point[2]):
                 continue
             a, b = self._names[point[1], point[3]], self._names[point[2], point[4]]
             pair = (a, b) if a <= b else (b, a)
@@ -297,26 +329,12 @@ class PyBulletBackend(Backend):
             "last_target": self._last_target.tolist(),
             "time": self._time,
         }
-        body = zlib.compress(json.dumps(head).encode() + b"\n" + world, 1)
-        return _MAGIC + hashlib.sha256(body).digest() + body
+        return pack_state(self.name, head, world)
 
     def restore(self, state: bytes) -> None:
-        try:
-            if not state.startswith(_MAGIC):
-                raise ValueError("not a state of this backend")
-            sha, packed = state[len(_MAGIC) :][:32], state[len(_MAGIC) + 32 :]
-            if hashlib.sha256(packed).digest() != sha:
-                raise ValueError("damaged")
-            head_line, world = zlib.decompress(packed).split(b"\n", 1)
-            head = json.loads(head_line)
-        except (ValueError, zlib.error) as error:
-            raise BrokenFile(f"saved state: {error}; record the demonstration again") from error
-        if head["scene"] != self._scene_digest:
-            raise BrokenFile(
-                f"saved state: of robot {head['robot']!r} with {head['bodies']}, this backend "
-                f"has {self.robot.name!r} with {sorted(self._bodies)} or other shapes; load the "
-                "matching task"
-            )
+        head, world = unpack_state(
+            self.name, state, self.robot.name, self._scene_digest, sorted(self._bodies)
+        )
         handle, path = tempfile.mkstemp(suffix=".bullet")
         try:
             with os.fdopen(handle, "wb") as file:
@@ -338,19 +356,27 @@ class PyBulletBackend(Backend):
             self._client = None
 
 
-def _make_body(client: Any, body: Body) -> int:
-    visuals = _arrays(body.shapes, drawn=True)
-    collisions = [shape for shape in body.shapes if shape.collides]
-    visual = client.createVisualShapeArray(**visuals)
-    collision = (
-        client.createCollisionShapeArray(**_arrays(collisions, drawn=False)) if collisions else -1
-    )
-    T = body.T_world_body
-    index = client.createMultiBody(
-        body.mass or 0.0, collision, visual, T[:3, 3].tolist(), _quaternion(T)
-    )
-    client.changeDynamics(index, -1, lateralFriction=body.friction)
-    return int(index)
+@contextmanager
+def _urdf_file(root: Body, moving: Iterable[Body]) -> Iterator[str]:
+    """A URDF of a body and of those that move on it, for as long as it is read."""
+    robot = ET.Element("robot", name=root.name)
+    for body in (root, *moving):
+        robot.append(rigid_link(body.name, body.shapes, body.mass or 0.0))
+        if body.joint is not None:
+            joint = add_joint(
+                robot, f"{body.name}_joint", root.name, body.name,
+                body.joint.T_parent_body, body.joint.kind,
+            )  # fmt: skip
+            ET.SubElement(joint, "axis", xyz=" ".join(map(str, body.joint.axis)))
+            limits = {"lower": body.joint.lower, "upper": body.joint.upper}
+            ET.SubElement(joint, "limit", {k: str(v) for k, v in limits.items()})
+    handle, path = tempfile.mkstemp(suffix=".urdf")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            ET.ElementTree(robot).write(file)
+        yield path
+    finally:
+        os.unlink(path)
 
 
 def _projection(fov_y_deg: float, near: float, far: float, size: int) -> list[float]:
@@ -362,22 +388,6 @@ def _projection(fov_y_deg: float, near: float, far: float, size: int) -> list[fl
     matrix[8] += 1.0 / size
     matrix[9] += 1.0 / size
     return matrix
-
-
-def _arrays(shapes: Sequence[Shape], drawn: bool) -> dict[str, Any]:
-    kinds = {"box": p.GEOM_BOX, "cylinder": p.GEOM_CYLINDER, "sphere": p.GEOM_SPHERE}
-    origin = "visualFrame" if drawn else "collisionFrame"
-    arrays: dict[str, Any] = {
-        "shapeTypes": [kinds[s.kind] for s in shapes],
-        "halfExtents": [[v / 2 for v in s.size] if s.kind == "box" else [0] * 3 for s in shapes],
-        "radii": [0.0 if s.kind == "box" else s.size[0] for s in shapes],
-        "lengths": [s.size[1] if s.kind == "cylinder" else 0.0 for s in shapes],
-        f"{origin}Positions": [s.T_body_shape[:3, 3].tolist() for s in shapes],
-        f"{origin}Orientations": [_quaternion(s.T_body_shape) for s in shapes],
-    }
-    if drawn:
-        arrays["rgbaColors"] = [list(s.rgba) for s in shapes]
-    return arrays
 
 
 def _matrix(position: Sequence[float], quaternion: Sequence[float]) -> Array:

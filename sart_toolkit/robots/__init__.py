@@ -10,6 +10,7 @@ from sart_toolkit.tables import lookup
 
 ROBOTS = {
     "ur5e_2f85": "sart_toolkit.robots.ur5e_2f85:SPEC",
+    "ur5e_hande": "sart_toolkit.robots.ur5e_hande:SPEC",
 }
 
 

@@ -16,6 +16,7 @@ _IK_STEPS = 60
 _IK_DAMPING = 1e-4
 _IK_TOLERANCE = 1e-6
 _IK_MAX_STEP = 0.4
+_LIMIT_TOLERANCE = 1e-6
 
 
 class RobotModel:
@@ -50,13 +51,13 @@ class RobotModel:
         self.gripper = float(gripper)
         self.urdf = composed_urdf(spec, held)
         full = pin.buildModelFromUrdf(str(self.urdf))
-        angles = spec.gripper.joint_angles(gripper)
-        missing = [n for n in (*spec.arm_joints, *angles) if not full.existJointName(n)]
+        linkage = spec.gripper.joint_positions(gripper)
+        missing = [n for n in (*spec.arm_joints, *linkage) if not full.existJointName(n)]
         if missing:
             raise unknown_name("joint", missing[0], list(full.names)[1:])
         reference = pin.neutral(full)
-        for name, angle in angles.items():
-            reference[full.joints[full.getJointId(name)].idx_q] = angle
+        for name, position in linkage.items():
+            reference[full.joints[full.getJointId(name)].idx_q] = position
         locked = [
             full.getJointId(name) for name in list(full.names)[1:] if name not in spec.arm_joints
         ]
@@ -88,6 +89,22 @@ class RobotModel:
             InvalidInput: wrong shape or not finite.
         """
         return check_array("q", q, (self._model.nq,))
+
+    def check_limits(self, q: Array) -> Array:
+        """A float64 copy of a joint configuration `(n,)` within the joint limits.
+
+        Raises:
+            InvalidInput: wrong shape, not finite, or outside the limits.
+        """
+        q = self.check_q(q)
+        over = (q < self.lower - _LIMIT_TOLERANCE) | (q > self.upper + _LIMIT_TOLERANCE)
+        if over.any():
+            j = int(np.argmax(over))
+            raise InvalidInput(
+                f"{self.spec.arm_joints[j]}: {q[j]:.3f} rad is outside its limits "
+                f"[{self.lower[j]:.3f}, {self.upper[j]:.3f}]"
+            )
+        return q
 
     def fk(self, q: Array, frame: str | None = None) -> Array:
         """The pose `(4, 4)` of a frame (default: the tool) in the world at `q`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -51,6 +51,40 @@ class Shape:
             half = np.full(3, self.size[0])
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
         return signs * half @ self.T_body_shape[:3, :3].T + self.T_body_shape[:3, 3]
+
+
+def mass_properties(shapes: Sequence[Shape], mass: float) -> tuple[Array, Array]:
+    """The centre of mass `(3,)` [m] and the inertia `(3, 3)` [kg m²] about it, body axes.
+
+    The mass [kg] is spread evenly over the volume of the shapes that collide, or of all shapes
+    where none does; where two overlap both count.
+    """
+    solid = [shape for shape in shapes if shape.collides] or list(shapes)
+    volumes, moments = zip(*(_volume_and_moments(shape) for shape in solid), strict=True)
+    masses = mass * np.array(volumes) / sum(volumes)
+    p = np.stack([shape.T_body_shape[:3, 3] for shape in solid])
+    centre = masses @ p / mass
+    inertia = np.zeros((3, 3))
+    for m, moment, shape, offset in zip(masses, moments, solid, p - centre, strict=True):
+        R = shape.T_body_shape[:3, :3]
+        # Steiner's theorem.
+        inertia += m * (
+            R @ np.diag(moment) @ R.T + offset @ offset * np.eye(3) - np.outer(offset, offset)
+        )
+    return centre, inertia
+
+
+def _volume_and_moments(shape: Shape) -> tuple[float, Array]:
+    """The volume [m³] and the principal moments `(3,)` per mass [m²] about the shape's centre."""
+    if shape.kind == "box":
+        square = np.square(shape.size)
+        return float(np.prod(shape.size)), (square.sum() - square) / 12
+    r = shape.size[0]
+    if shape.kind == "sphere":
+        return 4 / 3 * np.pi * r**3, np.full(3, 0.4 * r**2)
+    length = shape.size[1]
+    across = r**2 / 4 + length**2 / 12
+    return np.pi * r**2 * length, np.array([across, across, r**2 / 2])
 
 
 @dataclass(frozen=True)
@@ -124,25 +158,26 @@ def look_at(p_camera: Array, p_target: Array, up: Array) -> Array:
 class GripperSpec:
     """A gripper: its URDF, its linkage, and what its one command means.
 
-    The command is 0 open, 1 closed. `driver` is the joint that the motor turns, from 0 to
-    `closed_angle` [rad]; `followers` maps each linked joint to its ratio to the driver.
-    `finger_links` are the links that may touch what is grasped; `force` [N m] bounds the driver.
+    The command is 0 open, 1 closed. `driver` is the joint that the motor moves, from 0 to
+    `closed_position` ([rad], or [m] where it slides); `followers` maps each linked joint to its
+    ratio to the driver. `finger_links` are the links that may touch what is grasped. `force`
+    ([N m] or [N]) and `speed` ([rad/s] or [m/s]) bound the driver.
     """
 
     urdf: str
     parent_frame: str
     driver: str
     followers: Mapping[str, float]
-    closed_angle: float
+    closed_position: float
     finger_links: tuple[str, ...]
     T_parent_gripper: Array = field(default_factory=lambda: np.eye(4))
     force: float = 20.0
     speed: float = 2.0
 
-    def joint_angles(self, command: float) -> dict[str, float]:
-        """Every linkage joint's angle [rad] at a command in [0, 1]."""
-        angle = self.closed_angle * command
-        return {self.driver: angle, **{name: angle * r for name, r in self.followers.items()}}
+    def joint_positions(self, command: float) -> dict[str, float]:
+        """Every linkage joint's position [rad or m] at a command in [0, 1]."""
+        at = self.closed_position * command
+        return {self.driver: at, **{name: at * r for name, r in self.followers.items()}}
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,16 @@ import trimesh
 
 from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, SartError, unknown_name
 from sart_toolkit.poses import Array
-from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape, resource_path
+from sart_toolkit.robots.spec import (
+    Attachment,
+    RobotSpec,
+    Shape,
+    mass_properties,
+    resource_path,
+)
 
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 8
+_RECIPE = 9
 _ARM_FACES, _GRIPPER_FACES = 150, 300
 _GRIPPER_PREFIX = "gripper_"
 
@@ -54,7 +60,8 @@ def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
                 "recipe": _RECIPE,
                 "faces": (_ARM_FACES, _GRIPPER_FACES),
                 "sources": [(str(p), p.stat().st_size, p.stat().st_mtime) for p in sources],
-                "spec": _plain(spec),
+                # Cameras are no part of a URDF: one that is moved a little needs no new one.
+                "spec": {k: v for k, v in _plain(spec).items() if k != "wrist_camera"},
                 "attachments": _plain(attachments),
             },
             sort_keys=True,
@@ -115,12 +122,15 @@ def _compose(
             robot.append(element)
             if element.tag == "link":
                 _lighten(element, source.parent, work, spec)
-    _fix(robot, spec.gripper.parent_frame, spec.gripper_base, spec.gripper.T_parent_gripper)
+    for parent, child, T in (
+        (spec.gripper.parent_frame, spec.gripper_base, spec.gripper.T_parent_gripper),
+        (spec.gripper_base, spec.tool_frame, spec.T_gripper_tool),
+        *((body.frame, body.name, body.T_frame_body) for body in attachments),
+    ):
+        add_joint(robot, f"{child}_fixed", parent, child, T, "fixed")
     robot.append(ET.Element("link", name=spec.tool_frame))
-    _fix(robot, spec.gripper_base, spec.tool_frame, spec.T_gripper_tool)
-    for attachment in attachments:
-        robot.append(_attachment_link(attachment))
-        _fix(robot, attachment.frame, attachment.name, attachment.T_frame_body)
+    for body in attachments:
+        robot.append(rigid_link(body.name, body.shapes, body.mass))
     for kind in ("link", "joint"):
         names = [element.get("name") for element in robot.findall(kind)]
         twice = sorted({str(name) for name in names if names.count(name) > 1})
@@ -133,7 +143,7 @@ def _compose(
     for link in robot.findall("link"):
         if link.find("inertial") is None:
             # A simulator would give a link without inertia one kilogram.
-            link.append(_inertial(1e-3, np.full(3, 1e-6)))
+            link.append(_inertial(1e-3, np.zeros(3), 1e-6 * np.eye(3)))
     ET.indent(robot)
     ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)
 
@@ -259,37 +269,42 @@ def _material(name: str, rgba: tuple[float, ...]) -> ET.Element:
     return material
 
 
-def _inertial(mass: float, diagonal: Array, p: Sequence[float] = (0, 0, 0)) -> ET.Element:
+def _inertial(mass: float, p: Array, inertia: Array) -> ET.Element:
     inertial = ET.Element("inertial")
     ET.SubElement(inertial, "origin", xyz=_numbers(p), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=f"{mass:.9g}")
-    ixx, iyy, izz = (f"{d:.9g}" for d in diagonal)
-    ET.SubElement(inertial, "inertia", ixx=ixx, ixy="0", ixz="0", iyy=iyy, iyz="0", izz=izz)
+    entries = {
+        f"i{a}{b}": f"{inertia[i, j]:.9g}"
+        for i, a in enumerate("xyz")
+        for j, b in enumerate("xyz")
+        if i <= j
+    }
+    ET.SubElement(inertial, "inertia", entries)
     return inertial
 
 
-def _fix(robot: ET.Element, parent: str, child: str, T_parent_child: Array) -> None:
-    joint = ET.SubElement(robot, "joint", name=f"{child}_fixed", type="fixed")
+def add_joint(
+    robot: ET.Element, name: str, parent: str, child: str, T_parent_child: Array, kind: str
+) -> ET.Element:
+    """A joint of a URDF's `robot` element, by its kind (`fixed`, `revolute` or `prismatic`)."""
+    joint = ET.SubElement(robot, "joint", name=name, type=kind)
     joint.append(_origin(T_parent_child))
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
+    return joint
 
 
-def _attachment_link(attachment: Attachment) -> ET.Element:
-    link = ET.Element("link", name=attachment.name)
-    points = np.concatenate([shape.corners() for shape in attachment.shapes])
-    low, high = points.min(0), points.max(0)
-    edges = high - low
-    # The inertia of a box around the shapes: right for a box, and close enough for the rest.
-    diagonal = attachment.mass / 12 * (np.sum(edges**2) - edges**2)
-    link.append(_inertial(attachment.mass, diagonal, (low + high) / 2))
-    for index, shape in enumerate(attachment.shapes):
+def rigid_link(name: str, shapes: Sequence[Shape], mass: float) -> ET.Element:
+    """A URDF link of primitives, its inertia that of an even mass [kg]; 0 for one that is fixed."""
+    link = ET.Element("link", name=name)
+    link.append(_inertial(mass, *mass_properties(shapes, mass or 1.0)))
+    for index, shape in enumerate(shapes):
         for kind in ("visual", "collision") if shape.collides else ("visual",):
             element = ET.SubElement(link, kind)
             element.append(_origin(shape.T_body_shape))
             element.append(_geometry(shape))
             if kind == "visual":
-                element.append(_material(f"{attachment.name}_{index}", shape.rgba))
+                element.append(_material(f"{name}_{index}", shape.rgba))
     return link
 
 

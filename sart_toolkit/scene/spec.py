@@ -1,22 +1,122 @@
-"""A scene as data: bodies made of convex shapes, and what the gripper holds."""
+"""A scene as data: bodies made of convex shapes, joints between them, light, what is held."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from sart_toolkit.errors import InvalidInput, unknown_name
-from sart_toolkit.poses import Array, check_array, check_pose, check_positive, frozen
+from sart_toolkit.poses import (
+    Array,
+    check_array,
+    check_pose,
+    check_positive,
+    frozen,
+    inverse,
+    log_rotation,
+    pose,
+)
 from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape
+
+_LIMIT_TOLERANCE = 1e-6
+_POSE_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Detent:
+    """A catch that a joint snaps into at `position`, felt within `width` ([rad] or [m]) of it.
+
+    At a distance x from the catch, |x| < width, it acts with -effort sin(2 pi x / width) ([N m] or
+    [N]): the nearer half draws in, the farther half keeps out.
+    """
+
+    position: float
+    width: float
+    effort: float
+
+    def __post_init__(self) -> None:
+        check_positive("width of a detent", self.width)
+        check_positive("effort of a detent", self.effort)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How a body moves on a body that never does: a hinge (`revolute`) or a slide (`prismatic`).
+
+    At position 0 the body stands at `T_parent_body (4, 4)`; it turns about, or slides along, the
+    line through its own origin in direction `axis (3,)`. Positions from `lower` to `upper` are
+    [rad] or [m], efforts [N m] or [N]. `friction` is the dry friction that holds the joint;
+    a spring of `stiffness` (effort per position) pulls towards `rest`; `detent` is a catch.
+    """
+
+    parent: str
+    T_parent_body: Array
+    axis: Array
+    lower: float
+    upper: float
+    kind: Literal["revolute", "prismatic"] = "revolute"
+    friction: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    detent: Detent | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("revolute", "prismatic"):
+            raise InvalidInput(f"joint kind: expected 'revolute' or 'prismatic', got {self.kind!r}")
+        T = check_pose("T_parent_body", self.T_parent_body)
+        object.__setattr__(self, "T_parent_body", frozen(T))
+        axis = check_array("axis", self.axis, (3,))
+        if abs(float(np.linalg.norm(axis)) - 1.0) > 1e-6:
+            raise InvalidInput(f"joint axis: expected a unit vector, got {axis}")
+        object.__setattr__(self, "axis", frozen(axis))
+        for name in ("lower", "upper", "friction", "stiffness", "rest"):
+            check_array(name, getattr(self, name), ())
+        if not self.lower < self.upper:
+            raise InvalidInput(
+                f"joint limits: expected lower < upper, got {self.lower} and {self.upper}"
+            )
+        if self.friction < 0 or self.stiffness < 0:
+            raise InvalidInput(
+                f"joint: expected friction and stiffness >= 0, got {self.friction} and "
+                f"{self.stiffness}"
+            )
+
+    def effort(self, position: float) -> float:
+        """What spring and catch act with at a position ([N m] or [N]); friction not counted."""
+        effort = self.stiffness * (self.rest - position)
+        if self.detent is not None:
+            x = position - self.detent.position
+            if abs(x) < self.detent.width:
+                effort -= self.detent.effort * float(np.sin(2 * np.pi * x / self.detent.width))
+        return effort
+
+    def T_parent_moved(self, position: float) -> Array:
+        """The body's pose `(4, 4)` in its parent at a joint position."""
+        offset = self.axis * position
+        return self.T_parent_body @ (
+            pose(rotvec=offset) if self.kind == "revolute" else pose(offset)
+        )
+
+    def position(self, T_parent_moved: Array) -> float:
+        """The joint position at which the body has a pose `(4, 4)` in its parent."""
+        T = inverse(self.T_parent_body) @ T_parent_moved
+        if self.kind == "prismatic":
+            return float(self.axis @ T[:3, 3])
+        angle = float(self.axis @ log_rotation(T[:3, :3]))
+        # A rotation is known up to whole turns: take the one nearest to the joint's range.
+        turns = round(((self.lower + self.upper) / 2 - angle) / (2 * np.pi))
+        return angle + 2 * np.pi * turns
 
 
 @dataclass(frozen=True)
 class Body:
     """A rigid body standing in the world; its pose is part of the `SceneState`.
 
-    `mass` [kg], or `None` for one that never moves; `friction` is the Coulomb coefficient.
+    `mass` [kg], or `None` for one that never moves; `friction` is the Coulomb coefficient. A body
+    with a `joint` moves on another one only; `T_world_body` is then of no account.
     """
 
     name: str
@@ -24,14 +124,41 @@ class Body:
     T_world_body: Array = field(default_factory=lambda: np.eye(4))
     mass: float | None = None
     friction: float = 0.5
+    joint: Joint | None = None
 
     def __post_init__(self) -> None:
         if self.mass is not None:
             check_positive(f"mass of {self.name}", self.mass, "kg")
+        elif self.joint is not None:
+            raise InvalidInput(f"body {self.name!r}: has a joint but no mass; give it one")
         if not self.shapes:
             raise InvalidInput(f"body {self.name!r}: has no shape; give it at least one")
         T = check_pose(f"T_world_body of {self.name}", self.T_world_body)
         object.__setattr__(self, "T_world_body", frozen(T))
+
+
+@dataclass(frozen=True)
+class Light:
+    """A distant light: `direction (3,)` from the scene towards it, world frame.
+
+    `intensity`: what a face turned to it reflects of its colour; `ambient`: what any face does.
+    """
+
+    direction: Array = field(default_factory=lambda: np.array([0.3, 0.4, 1.0]))
+    intensity: float = 0.35
+    ambient: float = 0.6
+
+    def __post_init__(self) -> None:
+        direction = check_array("direction of the light", self.direction, (3,))
+        if not np.linalg.norm(direction) > 0:
+            raise InvalidInput("direction of the light: expected a vector of some length, got 0")
+        object.__setattr__(self, "direction", frozen(direction / np.linalg.norm(direction)))
+        for name in ("intensity", "ambient"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InvalidInput(
+                    f"{name} of the light: expected a finite number >= 0, got {value}"
+                )
 
 
 @dataclass(frozen=True)
@@ -45,6 +172,7 @@ class SceneSpec:
     held: tuple[Attachment, ...] = ()
     cameras: tuple[CameraSpec, ...] = ()
     gravity: Array = field(default_factory=lambda: np.array([0.0, 0.0, -9.81]))
+    light: Light = field(default_factory=Light)
 
     def __post_init__(self) -> None:
         names = [body.name for body in self.bodies] + [body.name for body in self.held]
@@ -55,35 +183,128 @@ class SceneSpec:
         twice = sorted({name for name in cameras if cameras.count(name) > 1})
         if twice:
             raise InvalidInput(f"scene: two cameras are called {twice[0]!r}; rename one")
+        still = [body.name for body in self.bodies if body.mass is None]
+        for body in self.bodies:
+            if body.joint is not None and body.joint.parent not in still:
+                raise unknown_name(
+                    f"body without mass, which {body.name!r} moves on,", body.joint.parent, still
+                )
         object.__setattr__(self, "gravity", frozen(check_array("gravity", self.gravity, (3,))))
 
+    @property
+    def jointed(self) -> dict[str, Body]:
+        """The bodies that move on others, by name."""
+        return {body.name: body for body in self.bodies if body.joint is not None}
+
     def initial_state(
-        self, q: Array, gripper: float, Ts_world_body: Mapping[str, Array] | None = None
+        self,
+        q: Array,
+        gripper: float,
+        Ts_world_body: Mapping[str, Array] | None = None,
+        joint_positions: Mapping[str, float] | None = None,
+        gripper_target: float | None = None,
     ) -> SceneState:
         """The state with the robot at `q`, bodies where the scene has them or where told.
 
+        Args:
+            q: robot joints `(n,)` [rad].
+            gripper: where the gripper is, in [0, 1].
+            Ts_world_body: poses `(4, 4)` of bodies that stand by themselves.
+            joint_positions: of bodies that move on others, by the body's name; 0 where left out.
+            gripper_target: command in force, where it differs from `gripper`.
+
         Raises:
-            UnknownName: a body in `Ts_world_body` isn't in the scene.
+            UnknownName: a body told of isn't in the scene, or isn't of that sort.
         """
-        poses = {body.name: body.T_world_body for body in self.bodies}
+        poses = {body.name: body.T_world_body for body in self.bodies if body.joint is None}
         for name, T in (Ts_world_body or {}).items():
             if name not in poses:
                 raise unknown_name("body", name, poses)
             poses[name] = T
-        return SceneState(q, gripper, poses)
+        positions = dict.fromkeys(self.jointed, 0.0)
+        for name, position in (joint_positions or {}).items():
+            if name not in positions:
+                raise unknown_name("body with a joint", name, positions)
+            positions[name] = float(position)
+        for name, body in self.jointed.items():
+            assert body.joint is not None
+            poses[name] = poses[body.joint.parent] @ body.joint.T_parent_moved(positions[name])
+        return SceneState(q, gripper, poses, positions, gripper_target)
+
+    def joint_position(self, name: str, Ts_world_body: Mapping[str, Array]) -> float:
+        """The position [rad or m] of the joint that body `name` moves on, from all bodies' poses.
+
+        Raises:
+            UnknownName: the body has no joint, or a pose is missing.
+        """
+        if name not in self.jointed:
+            raise unknown_name("body with a joint", name, self.jointed)
+        joint = self.jointed[name].joint
+        assert joint is not None
+        for each in (name, joint.parent):
+            if each not in Ts_world_body:
+                raise unknown_name("body", each, Ts_world_body)
+        return joint.position(inverse(Ts_world_body[joint.parent]) @ Ts_world_body[name])
+
+    def check_state(self, state: SceneState) -> None:
+        """Refuse a state that isn't one of this scene; the robot's joints are not looked at.
+
+        Raises:
+            UnknownName: it has a body that the scene hasn't, or lacks one.
+            InvalidInput: a joint is outside its limits, or a body isn't where its joint has it.
+        """
+        known = [body.name for body in self.bodies]
+        for kind, names, wanted in (
+            ("body in the state", state.Ts_world_body, known),
+            ("joint in the state", state.joint_positions, self.jointed),
+        ):
+            odd = sorted(set(names) ^ set(wanted))
+            if odd:
+                raise unknown_name(kind, odd[0], wanted)
+        for name, body in self.jointed.items():
+            joint, position = body.joint, state.joint_positions[name]
+            assert joint is not None
+            if not joint.lower - _LIMIT_TOLERANCE <= position <= joint.upper + _LIMIT_TOLERANCE:
+                raise InvalidInput(
+                    f"joint of {name!r}: {position:.3f} is outside its limits "
+                    f"[{joint.lower:.3f}, {joint.upper:.3f}]"
+                )
+            T = state.Ts_world_body[joint.parent] @ joint.T_parent_moved(position)
+            if np.abs(T - state.Ts_world_body[name]).max() > _POSE_TOLERANCE:
+                raise InvalidInput(
+                    f"pose of {name!r}: isn't where its joint at {position:.3f} has it; make "
+                    "states with SceneSpec.initial_state"
+                )
 
 
 @dataclass(frozen=True)
 class SceneState:
-    """Where all is at rest: joints `q (n,)` [rad], gripper in [0, 1], body poses `(4, 4)`."""
+    """Where all is at rest: joints `q (n,)` [rad], gripper in [0, 1], body poses `(4, 4)`.
+
+    `joint_positions` ([rad] or [m]) are those of the bodies that move on others, whose poses
+    follow. `gripper_target` is the command in force where it isn't `gripper`: beyond it where
+    something is grasped.
+    """
 
     q: Array
     gripper: float
     Ts_world_body: Mapping[str, Array]
+    joint_positions: Mapping[str, float] = field(default_factory=dict)
+    gripper_target: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "q", frozen(check_array("q", self.q, (None,))))
-        if not 0.0 <= self.gripper <= 1.0:
-            raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {self.gripper}")
+        for value in (self.gripper, self.commanded_gripper):
+            if not 0.0 <= value <= 1.0:
+                raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {value}")
         poses = {k: frozen(check_pose(k, T)) for k, T in self.Ts_world_body.items()}
         object.__setattr__(self, "Ts_world_body", poses)
+        positions = {
+            k: float(check_array(f"joint of {k}", v, ())) for k, v in self.joint_positions.items()
+        }
+        object.__setattr__(self, "joint_positions", positions)
+
+    @property
+    def commanded_gripper(self) -> float:
+        """The gripper command in force, in [0, 1]."""
+        return self.gripper if self.gripper_target is None else self.gripper_target

@@ -7,8 +7,9 @@ import numpy as np
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import Array, inverse, pose
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, look_at
+from sart_toolkit.robots.spec import Attachment, Shape
 from sart_toolkit.scene.spec import Body, SceneSpec, SceneState
+from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
 from sart_toolkit.tasks.task import Placement, Stage, Task
 
 PEG_WIDTH, PEG_LENGTH = 0.03, 0.08
@@ -19,7 +20,6 @@ _START_CLEARANCE = 0.125
 _INSERTION = 0.03
 _MIDDLE = np.array([0.50, 0.0, 0.0])
 _GRIPPER = 0.67
-_TABLE = (0.55, 0.50, 0.44, 1.0)
 _WOOD = (0.86, 0.62, 0.30, 1.0)
 _PEG = (0.20, 0.45, 0.80, 1.0)
 
@@ -64,10 +64,7 @@ class PegInHole(Task):
     report_body = "block"
     scene = SceneSpec(
         bodies=(
-            Body(
-                "table",
-                (Shape("box", (2.4, 2.4, 0.1), pose([0.5, 0, -0.05]), _TABLE),),
-            ),
+            TABLE,
             _block(),
         ),
         held=(
@@ -79,30 +76,14 @@ class PegInHole(Task):
                 mass=0.1,
             ),
         ),
-        cameras=(
-            CameraSpec(
-                "overview",
-                "world",
-                look_at(
-                    np.array([1.05, -0.60, 0.42]),
-                    np.array([0.45, 0.0, 0.17]),
-                    np.array([0.0, 0.0, 1.0]),
-                ),
-                fov_y_deg=38.0,
-                near=0.05,
-                far=6.0,
-            ),
-        ),
+        cameras=(OVERVIEW,),
     )
 
     @staticmethod
     def _start() -> Array:
         """The tool's pose at the start: pointing down, the camera on the robot's side."""
         z = HOLE_DEPTH + _START_CLEARANCE + _PEG_TIP_BELOW_TOOL
-        T = np.eye(4)
-        T[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
-        T[:3, 3] = _MIDDLE + [0, 0, z]
-        return T
+        return tool_down(_MIDDLE + [0, 0, z])
 
     def initial_state(self, model: RobotModel, placement: Placement) -> SceneState:
         q = model.ik(self._start(), model.spec.home)

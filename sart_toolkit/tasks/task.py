@@ -56,8 +56,10 @@ class Placement:
 class Stage:
     """One leg of an operator's plan: steer the tool to `T_world_tool (4,4)`, then go on.
 
-    The leg ends when the tool is within `tolerance` [m] and `tolerance_deg`. `speed` [m/s] is what
-    a person would choose there; `gripper` is the command held throughout.
+    The leg ends when the tool has been within `tolerance` [m] and `tolerance_deg` for `pause` [s]
+    (while fingers close, for instance). `speed` [m/s] is what a person would choose there;
+    `gripper` is the command held throughout. With `through` the operator neither slows down before
+    the end nor hesitates after it: a point on a curve.
     """
 
     T_world_tool: Array
@@ -65,6 +67,8 @@ class Stage:
     speed: float
     tolerance: float = 0.003
     tolerance_deg: float = 2.0
+    pause: float = 0.0
+    through: bool = False
 
 
 class Task(abc.ABC):
@@ -75,6 +79,7 @@ class Task(abc.ABC):
         robot: the robot it is made for.
         scene: bodies, held bodies and fixed cameras.
         placement_range: half width [m] of the square that the object is placed in.
+        yaw_range_deg: the largest turn [deg] either way that its operator can cope with.
         horizon: longest rollout [s].
         hold: how long [s] success must last before a rollout ends early.
         report_body: the body whose placement varies.
@@ -84,6 +89,7 @@ class Task(abc.ABC):
     robot: str
     scene: SceneSpec
     placement_range: float
+    yaw_range_deg: float = 15.0
     horizon: float
     hold: float = 1.0
     report_body: str
@@ -104,7 +110,21 @@ class Task(abc.ABC):
     def plan(self, state: SceneState) -> list[Stage]:
         """The legs by which a person would steer the tool from the start to the goal."""
 
-    def sample_placement(self, rng: np.random.Generator) -> Placement:
-        """A placement drawn uniformly from the square of half width `placement_range`."""
+    def sample_placement(self, rng: np.random.Generator, yaw_deg: float = 0.0) -> Placement:
+        """A placement drawn uniformly from the square of half width `placement_range`.
+
+        Args:
+            rng: source of randomness.
+            yaw_deg: the object is also turned, uniformly within ± this [deg]; at 0 it is not.
+
+        Raises:
+            InvalidInput: `yaw_deg` is negative or beyond `yaw_range_deg`.
+        """
+        if not 0.0 <= yaw_deg <= self.yaw_range_deg:
+            raise InvalidInput(
+                f"yaw_deg: {self.name} can be turned by 0 to {self.yaw_range_deg:g} deg either "
+                f"way, got {yaw_deg}"
+            )
         x, y = rng.uniform(-self.placement_range, self.placement_range, size=2)
-        return Placement(float(x), float(y))
+        yaw = rng.uniform(-yaw_deg, yaw_deg) if yaw_deg else 0.0
+        return Placement(float(x), float(y), float(yaw))

@@ -68,6 +68,7 @@ class ScriptedOperator(Device):
         self._rng = rng
         self._style = style or OperatorStyle()
         self._leg = 0
+        self._paused = 0.0
         self._still = 0.0
         self._hesitating = 0.0
         self._velocity = np.zeros(6)
@@ -79,17 +80,22 @@ class ScriptedOperator(Device):
         error = relative_motion(observation.T_world_tool, stage.T_world_tool)
         far, turn = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
         if far < stage.tolerance and turn < np.deg2rad(stage.tolerance_deg):
-            if self._leg + 1 < len(self._stages):
-                self._leg += 1
-                self._hesitating = float(self._rng.uniform(0.0, style.hesitation))
-                return self.read(observation)
-            self._still += dt
+            self._paused += dt
+            if self._paused > stage.pause:
+                if self._leg + 1 < len(self._stages):
+                    self._leg += 1
+                    self._paused = 0.0
+                    if not stage.through:
+                        self._hesitating = float(self._rng.uniform(0.0, style.hesitation))
+                    return self.read(observation)
+                self._still += dt
         elif self._still > 0:
             self._still += dt
         resting = self._still > 0
         wanted = np.zeros(6)
         if not resting:
-            speed = min(stage.speed, max(style.approach * far, style.creep))
+            near = stage.speed if stage.through else max(style.approach * far, style.creep)
+            speed = min(stage.speed, near)
             if self._hesitating > 0:
                 self._hesitating -= dt
                 speed = min(speed, style.creep)

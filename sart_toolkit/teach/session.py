@@ -106,7 +106,7 @@ def record_demonstration(
     backend.reset(state)
     controller.reset(state.q)
     recorder = StepRecorder(backend, config.cameras)
-    gripper = state.gripper
+    gripper = state.commanded_gripper
     can_save, feels = backend.capabilities.can_restore, backend.capabilities.has_contacts
     observation = recorder.add(controller, gripper, 0.0 if feels else np.nan)
     states = [backend.save()] if can_save else []

@@ -71,7 +71,7 @@ def make_tiny(tmp_path: Path, own_cache: Path) -> Callable[..., RobotSpec]:
             parent_frame="flange",
             driver="gripper_finger_joint",
             followers={},
-            closed_angle=1.0,
+            closed_position=1.0,
             finger_links=("gripper_finger",),
         )
         inside = changes.pop("gripper", {})

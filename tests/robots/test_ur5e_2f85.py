@@ -50,7 +50,7 @@ def test_the_pads_face_each_other_along_the_tools_x_axis(pads):
 
 def test_every_joint_of_the_linkage_stays_within_a_turn_of_the_driver(spec):
     for command in COMMANDS:
-        angles = spec.gripper.joint_angles(command)
+        angles = spec.gripper.joint_positions(command)
         driver = angles[spec.gripper.driver]
         assert driver == pytest.approx(0.8 * command)
         assert len(angles) == 6
