@@ -190,9 +190,11 @@ class Demonstration:
     """One demonstration: its 10 Hz steps, the bodies, and what it takes to start from any step.
 
     `timestamps (T,)` [s]; `body_Ts_world` maps body names to `(T, 4, 4)` (empty on hardware);
-    `success (T,)` bool per step; `raw_commands (M, 7)`: the operator's 30 Hz tool velocity
-    (xyz [m/s], rotation [rad/s], tool frame) and gripper target; `states`: the backend's portable
-    state at each step (empty where it has none); `seconds`: wall-clock time the person spent.
+    `success (T,)` bool per step; `touching`: for each step the pairs of names of bodies that have
+    touched since the step before (none where the backend can't tell); `raw_commands (M, 7)`: the
+    operator's 30 Hz tool velocity (xyz [m/s], rotation [rad/s], tool frame) and gripper target;
+    `states`: the backend's portable state at each step (empty where it has none); `seconds`:
+    wall-clock time the person spent.
     """
 
     task: str
@@ -203,6 +205,7 @@ class Demonstration:
     timestamps: Array
     body_Ts_world: Mapping[str, Array]
     success: NDArray[np.bool_]
+    touching: tuple[tuple[tuple[str, str], ...], ...]
     raw_commands: Array
     states: tuple[bytes, ...]
     operator: str
@@ -225,6 +228,10 @@ class Demonstration:
         if success.shape != (n,):
             raise InvalidInput(f"success: expected shape ({n},), got {success.shape}")
         object.__setattr__(self, "success", frozen(success))
+        touching = tuple(tuple((str(a), str(b)) for a, b in pairs) for pairs in self.touching)
+        if len(touching) != n:
+            raise InvalidInput(f"touching: expected pairs for {n} steps, got {len(touching)}")
+        object.__setattr__(self, "touching", touching)
         bodies = {k: frozen(check_poses(k, v)) for k, v in self.body_Ts_world.items()}
         for name, Ts in bodies.items():
             if len(Ts) != n:
@@ -252,6 +259,7 @@ class Demonstration:
                 **self.steps.content(),
                 "raw_commands": self.raw_commands,
                 "success": self.success,
+                "touching": self.touching,
                 "task": self.task,
                 "task_parameters": dict(self.task_parameters),
                 "robot": self.robot,

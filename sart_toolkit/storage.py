@@ -40,7 +40,7 @@ from sart_toolkit.records import (
     Steps,
 )
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 # --- writing safely -----------------------------------------------------------------------------
@@ -314,6 +314,7 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
         file["timestamps"] = d.timestamps
         file["raw_commands"] = d.raw_commands
         file["success"] = d.success
+        file["touching"] = json.dumps(d.touching)
         for name, Ts in d.body_Ts_world.items():
             file[f"body_Ts_world/{name}"] = Ts
         sizes = np.array([len(state) for state in d.states], dtype=np.int64)
@@ -353,6 +354,7 @@ def load_demonstration(path: Path) -> Demonstration:
             timestamps=file["timestamps"][()],
             raw_commands=file["raw_commands"][()],
             success=file["success"][()],
+            touching=json.loads(file["touching"][()]),
             body_Ts_world={k: v[()] for k, v in file.get("body_Ts_world", {}).items()},
             states=tuple(packed[a:b] for a, b in zip(starts, ends, strict=True)),
             **meta,

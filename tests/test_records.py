@@ -77,6 +77,7 @@ def make_demonstration(n=6, seed=0):
         timestamps=np.arange(n) / 10,
         body_Ts_world={"block": random_walk(n, rng)},
         success=np.arange(n) == n - 1,
+        touching=((),) * n,
         raw_commands=rng.normal(size=(3 * n, 7)),
         states=tuple(rng.bytes(int(size)) for size in rng.integers(0, 9, n)),
         operator="test",

@@ -101,6 +101,7 @@ def make_demonstration(n=5, seed=0, cameras=("wrist",), bodies=("block",), state
             name: np.stack([pose(rng.uniform(-1, 1, 3)) for _ in range(n)]) for name in bodies
         },
         success=rng.uniform(size=n) < 0.5,
+        touching=((), (("block", "peg"),)) * (n // 2) + ((),) * (n % 2),
         raw_commands=rng.normal(size=(3 * n, 7)),
         states=tuple(rng.bytes(int(k)) for k in rng.integers(0, 30, n)) if states else (),
         operator="Åsa",

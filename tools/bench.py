@@ -212,6 +212,7 @@ def _synthetic_dataset(n_episodes: int) -> Dataset:
         timestamps=np.arange(n) / 10,
         body_Ts_world={},
         success=np.ones(n, bool),
+        touching=((),) * n,
         raw_commands=np.zeros((3 * n, 7)),
         states=(),
         operator="none",

@@ -8,7 +8,7 @@ import functools
 import json
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.augment.strategies import SamplingConfig, get_strategy
-from sart_toolkit.backends.interface import Backend, BackendFactory
+from sart_toolkit.backends.interface import Backend, BackendFactory, Observation
 from sart_toolkit.errors import (
     BrokenFile,
     InvalidInput,
@@ -30,7 +30,7 @@ from sart_toolkit.errors import (
 )
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.motion.line import straight_line
-from sart_toolkit.poses import check_positive
+from sart_toolkit.poses import check_positive, distance, inverse
 from sart_toolkit.records import (
     CONTROL_PER_RECORD,
     RECORD_HZ,
@@ -67,6 +67,7 @@ KEPT = "kept"
 _LOG = "attempts.jsonl"
 _LEAST_ATTEMPTS = 20
 _ATTEMPTS_PER_EPISODE = 10
+_SLIP, _SLIP_DEG = 0.005, 3.0
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,8 @@ def try_segment(
     """The k-th try from a sphere: sample, move there, check, and reverse what was recorded.
 
     The robot starts from the restored state of waypoint t*, at the pose commanded there. Any
-    contact of robot or held objects at any physics step rejects the segment.
+    contact of the robot, or of what it holds or has grasped there, with anything else at any
+    physics step rejects the segment; so does an object that slips in the grasp.
 
     Args:
         backend: the robot in the demonstration's scene.
@@ -135,23 +137,30 @@ def try_segment(
     q_start = steps.commanded_joint_positions[t_star]
     T_start = steps.commanded_Ts_world_tool[t_star]
     gripper = float(steps.commanded_gripper[t_star])
+    scene = backend.scene
+    carried = scene.grasped(demonstration.touching[t_star], backend.robot.gripper.finger_links)
+    standing = {body.name for body in scene.bodies} - carried
     controller = ToolController(model)
     try:
         line = straight_line(model, q_start, T_start, proposal.T_world_sampled, config.duration)
         backend.restore(demonstration.states[t_star])
         controller.reset(q_start, T_start)
         recorder = StepRecorder(backend, (config.camera,))
-        measured = backend.observe().T_world_tool
+        start = backend.observe()
+        measured = start.T_world_tool
         for desired in line.sample(RECORD_HZ):
             for q in controller.move(desired, measured, CONTROL_PER_RECORD):
                 backend.command(q, gripper)
                 backend.step()
-                touching = backend.contacts()
-                if touching:
-                    return Attempt(f"contact {touching[0].a} / {touching[0].b}", None)
+                for touch in backend.contacts():
+                    if _unwanted({touch.a, touch.b}, standing, carried):
+                        return Attempt(f"contact {touch.a} / {touch.b}", None)
             if not np.allclose(controller.commanded_T_world_tool, desired, rtol=0, atol=1e-9):
                 return Attempt("tool lags behind the line", None)
             measured = recorder.add(controller, gripper, 0.0).T_world_tool
+        for name in sorted(carried):
+            if _slipped(name, start, recorder.observations[-1]):
+                return Attempt(f"{name} slipped in the grasp", None)
     except Unreachable:
         return Attempt("out of reach", None)
     except MotionRejected as error:
@@ -168,6 +177,21 @@ def try_segment(
         law=config.sampling.law,
     )
     return Attempt(KEPT, Episode(recorder.steps(slice(None, None, -1)), provenance))
+
+
+def _unwanted(pair: set[str], standing: set[str], carried: Collection[str]) -> bool:
+    """Whether two bodies that touch should not: the robot, with what it carries, and the rest."""
+    there = len(pair & standing)
+    if there == 0:
+        # Within the robot only a grasp is meant.
+        return pair.isdisjoint(carried)
+    return there == 1
+
+
+def _slipped(name: str, start: Observation, end: Observation) -> bool:
+    Ts = [inverse(seen.T_world_tool) @ seen.Ts_world_body[name] for seen in (start, end)]
+    far, turn = distance(*Ts)
+    return far > _SLIP or turn > np.deg2rad(_SLIP_DEG)
 
 
 class _Worker:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import coal
@@ -26,6 +26,16 @@ class PairDistance:
 
 
 @dataclass(frozen=True)
+class ToolClearance:
+    """A tool body's nearest body of the scene, and its `reach`: the distance [m] of its farthest
+    point from the tool frame.
+    """
+
+    nearest: PairDistance
+    reach: float
+
+
+@dataclass(frozen=True)
 class _Part:
     """One convex part of a link: its geometry and its pose in the joint that carries it."""
 
@@ -39,11 +49,9 @@ class _Part:
 class ClearanceModel:
     """Distances between the robot's convex parts, and between them and a scene's shapes.
 
-    The *tool bodies* are the parts that the last arm joint carries: gripper, camera, held objects.
-    The *arm bodies* are the others, those that no joint moves left out.
-
-    Attributes:
-        tool_reach: for each tool body, the distance [m] of its farthest point from the tool frame.
+    The *tool bodies* are what the last arm joint carries: gripper, camera, held objects, and the
+    bodies of the scene that are in its grasp. The *arm bodies* are the others, those that no joint
+    moves left out.
     """
 
     def __init__(self, model: RobotModel, scene: SceneSpec) -> None:
@@ -59,66 +67,83 @@ class ClearanceModel:
         # The last three joints of an arm share its wrist, whose links neighbour the tool.
         self._arm_apart = [part for part in self._arm if part.joint <= last - 3]
         self._shapes = [
-            (body.name, _geometry(shape), shape.T_body_shape)
+            (body.name, _geometry(shape), shape)
             for body in scene.bodies
             for shape in body.shapes
             if shape.collides
         ]
         T_joint_tool = inverse(self._joint_poses(model.spec.home)[last]) @ model.fk(model.spec.home)
         p_tool = T_joint_tool[:3, 3]
-        self.tool_reach = {
-            i: float(np.linalg.norm(part.points - p_tool, axis=1).max())
-            for i, part in enumerate(self._tool)
-        }
+        self._reach = [
+            float(np.linalg.norm(part.points - p_tool, axis=1).max()) for part in self._tool
+        ]
 
     def _joint_poses(self, q: Array) -> list[Array]:
         pin.forwardKinematics(self.model.pinocchio_model, self._data, self.model.check_q(q))
         return [np.array(T.homogeneous) for T in self._data.oMi]
 
     def _placed_scene(
-        self, Ts_world_body: Mapping[str, Array]
+        self, Ts_world_body: Mapping[str, Array], carried: Collection[str]
     ) -> list[tuple[str, coal.CollisionGeometry, coal.Transform3s]]:
         for name, _, _ in self._shapes:
             if name not in Ts_world_body:
                 raise unknown_name("body", name, Ts_world_body)
         return [
-            (name, geometry, _transform(Ts_world_body[name] @ T))
-            for name, geometry, T in self._shapes
+            (name, geometry, _transform(Ts_world_body[name] @ shape.T_body_shape))
+            for name, geometry, shape in self._shapes
+            if name not in carried
         ]
 
-    def tool_distances(
-        self, q: Array, Ts_world_body: Mapping[str, Array]
-    ) -> dict[int, PairDistance]:
-        """For each tool body, by index, its nearest body of the scene at `q (n,)`.
+    def tool_clearances(
+        self, q: Array, Ts_world_body: Mapping[str, Array], carried: Collection[str] = ()
+    ) -> list[ToolClearance]:
+        """For each tool body its nearest body of the scene at `q (n,)`.
 
         Args:
             q: joint configuration [rad].
             Ts_world_body: poses `(4, 4)` of the scene's bodies.
+            carried: names of those in the gripper's grasp.
 
         Raises:
             UnknownName: a body's pose is missing.
         """
         joints = self._joint_poses(q)
-        scene = self._placed_scene(Ts_world_body)
-        nearest = {}
-        for i, part in enumerate(self._tool):
-            T = _transform(joints[part.joint] @ part.T_joint_part)
+        scene = self._placed_scene(Ts_world_body, carried)
+        bodies = [
+            (part.link, part.geometry, joints[part.joint] @ part.T_joint_part, reach)
+            for part, reach in zip(self._tool, self._reach, strict=True)
+        ]
+        p_tool = self.model.fk(q)[:3, 3]
+        for name, geometry, shape in self._shapes:
+            if name in carried:
+                T = Ts_world_body[name]
+                points = shape.corners() @ T[:3, :3].T + T[:3, 3]
+                reach = float(np.linalg.norm(points - p_tool, axis=1).max())
+                bodies.append((name, geometry, T @ shape.T_body_shape, reach))
+        clearances = []
+        for link, geometry, T, reach in bodies:
+            placed = _transform(T)
             pairs = [
-                PairDistance(part.link, name, _distance(part.geometry, T, geometry, T_shape))
-                for name, geometry, T_shape in scene
+                PairDistance(link, name, _distance(geometry, placed, other, T_other))
+                for name, other, T_other in scene
             ]
-            nothing = PairDistance(part.link, "", np.inf)
-            nearest[i] = min(pairs, key=lambda pair: pair.distance, default=nothing)
-        return nearest
+            nothing = PairDistance(link, "", np.inf)
+            nearest = min(pairs, key=lambda pair: pair.distance, default=nothing)
+            clearances.append(ToolClearance(nearest, reach))
+        return clearances
 
-    def arm_distance(self, q: Array, Ts_world_body: Mapping[str, Array]) -> PairDistance:
+    def arm_distance(
+        self, q: Array, Ts_world_body: Mapping[str, Array], carried: Collection[str] = ()
+    ) -> PairDistance:
         """The nearest pair at `q (n,)` among arm against scene and tool against arm.
 
+        Bodies that are `carried` move with the tool and are left out.
+
         Raises:
             UnknownName: a body's pose is missing.
         """
         joints = self._joint_poses(q)
-        scene = self._placed_scene(Ts_world_body)
+        scene = self._placed_scene(Ts_world_body, carried)
         placed = {
             id(part): _transform(joints[part.joint] @ part.T_joint_part)
             for part in (*self._arm, *self._tool)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -245,6 +246,20 @@ class SceneSpec:
             if each not in Ts_world_body:
                 raise unknown_name("body", each, Ts_world_body)
         return joint.position(inverse(Ts_world_body[joint.parent]) @ Ts_world_body[name])
+
+    def grasped(
+        self, touching: Iterable[tuple[str, str]], finger_links: Sequence[str]
+    ) -> frozenset[str]:
+        """The bodies in a grasp: those free to move that two or more of the fingers touch.
+
+        Args:
+            touching: pairs of names that touch.
+            finger_links: the gripper's.
+        """
+        free = {b.name for b in self.bodies if b.mass is not None and b.joint is None}
+        pairs = {pair for a, b in touching for pair in ((a, b), (b, a))}
+        fingers = Counter(b for a, b in pairs if a in finger_links and b in free)
+        return frozenset(name for name, count in fingers.items() if count >= 2)
 
     def check_state(self, state: SceneState) -> None:
         """Refuse a state that isn't one of this scene; the robot's joints are not looked at.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sart_toolkit.backends.interface import Backend, Observation
+from sart_toolkit.backends.interface import Backend, Contact, Observation
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.motion.controller import ControllerConfig, ToolController
 from sart_toolkit.poses import Array, apply_motion, check_array, check_positive, frozen
@@ -111,6 +111,7 @@ def record_demonstration(
     observation = recorder.add(controller, gripper, 0.0 if feels else np.nan)
     states = [backend.save()] if can_save else []
     success, raw = [task.success(observation)], []
+    touching: list[tuple[tuple[str, str], ...]] = [()]
     stop = False
     while not stop:
         if len(success) > config.max_seconds * RECORD_HZ:
@@ -118,7 +119,7 @@ def record_demonstration(
                 f"the demonstration did not end within {config.max_seconds:.0f} s: "
                 f"{task.shortfall(observation)}; steer on, or allow more with max_seconds"
             )
-        force = 0.0 if feels else np.nan
+        contacts: list[Contact] = []
         for _ in range(CONTROL_PER_RECORD):
             now = backend.observe()
             velocity = np.zeros(6)
@@ -131,8 +132,10 @@ def record_demonstration(
             backend.command(_steered(controller, velocity, now.T_world_tool), gripper)
             backend.step()
             if feels:
-                force = max([force, *(contact.force for contact in backend.contacts())])
+                contacts += backend.contacts()
+        force = max([0.0, *(contact.force for contact in contacts)]) if feels else np.nan
         observation = recorder.add(controller, gripper, force)
+        touching.append(tuple(sorted({(contact.a, contact.b) for contact in contacts})))
         if can_save:
             states.append(backend.save())
         success.append(task.success(observation))
@@ -152,6 +155,7 @@ def record_demonstration(
             for name in rows[0].Ts_world_body
         },
         success=np.array(success),
+        touching=tuple(touching),
         raw_commands=np.stack(raw),
         states=tuple(states),
         operator=device.operator,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,6 +105,7 @@ def suggest_radius(
     T_world_key: Array,
     Ts_world_body: Mapping[str, Array],
     config: SuggestConfig,
+    carried: Collection[str] = (),
 ) -> Suggestion:
     """The largest radius around one waypoint that keeps the robot clear.
 
@@ -118,14 +119,16 @@ def suggest_radius(
         T_world_key: tool pose `(4, 4)` there.
         Ts_world_body: where the scene's bodies were.
         config: margins and limits.
+        carried: names of bodies in the gripper's grasp.
     """
-    pairs = clearances.tool_distances(q, Ts_world_body)
-    nearest = min(pair.distance for pair in pairs.values())
+    bodies = clearances.tool_clearances(q, Ts_world_body, carried)
+    nearest = min(body.nearest.distance for body in bodies)
     best = Suggestion(config.max_radius, nearest, "max_radius")
-    for i, pair in pairs.items():
+    for body in bodies:
+        pair = body.nearest
         r = certified_radius(
             pair.distance,
-            clearances.tool_reach[i],
+            body.reach,
             config.margin,
             config.rotation_per_metre,
             config.max_radius,
@@ -133,7 +136,7 @@ def suggest_radius(
         if r < best.radius:
             best = Suggestion(r, pair.distance, f"{pair.a} / {pair.b}")
     while best.radius >= config.min_radius:
-        problem = _probe(clearances, q, T_world_key, Ts_world_body, best.radius, config)
+        problem = _probe(clearances, q, T_world_key, Ts_world_body, best.radius, config, carried)
         if problem is None:
             return best
         best = Suggestion(best.radius * _SHRINK, best.clearance, problem)
@@ -147,6 +150,7 @@ def _probe(
     Ts_world_body: Mapping[str, Array],
     radius: float,
     config: SuggestConfig,
+    carried: Collection[str],
 ) -> str | None:
     """What goes wrong at one of the extreme poses of a radius, or None."""
     # Halton points of the four-dimensional square: direction of the offset, axis of the turn.
@@ -160,7 +164,7 @@ def _probe(
             q_probe = clearances.model.ik(T, q)
         except Unreachable:
             return "reach"
-        pair = clearances.arm_distance(q_probe, Ts_world_body)
+        pair = clearances.arm_distance(q_probe, Ts_world_body, carried)
         if pair.distance < config.margin:
             return f"{pair.a} / {pair.b}"
     return None
@@ -171,6 +175,55 @@ def _sphere_points(uv: Array) -> Array:
     z, psi = 1 - 2 * uv[:, 0], 2 * np.pi * uv[:, 1]
     flat = np.sqrt(np.maximum(0.0, 1 - z**2))
     return np.stack([flat * np.cos(psi), flat * np.sin(psi), z], axis=1)
+
+
+@dataclass(frozen=True)
+class _Phase:
+    """What a waypoint has in common with its neighbours until the gripper or a contact changes."""
+
+    gripper: float
+    carried: frozenset[str]
+    contacts: frozenset[tuple[str, str]]
+
+    def change(self, after: _Phase) -> str:
+        """What is other in the phase after this one."""
+        if self.gripper != after.gripper:
+            return "gripper command"
+        if self.carried != after.carried:
+            return "grasp of " + ", ".join(sorted(self.carried ^ after.carried))
+        return "contact " + " / ".join(min(self.contacts ^ after.contacts))
+
+
+def _phases(demonstration: Demonstration, robot: RobotSpec, scene: SceneSpec) -> list[_Phase]:
+    commands = demonstration.steps.commanded_gripper
+    standing = {body.name for body in scene.bodies}
+    phases = []
+    for command, touching in zip(commands, demonstration.touching, strict=True):
+        carried = scene.grasped(touching, robot.gripper.finger_links)
+        # A contact counts where the robot, or what it carries, touches what it doesn't carry.
+        contacts = frozenset(pair for pair in touching if len({*pair} & (standing - carried)) == 1)
+        phases.append(_Phase(round(float(command), 2), carried, contacts))
+    # Before the first step nothing has been felt yet.
+    return [dataclasses.replace(phases[1], gripper=phases[0].gripper), *phases[1:]]
+
+
+def _room_before_event(
+    demonstration: Demonstration, phases: Sequence[_Phase], t: int
+) -> Suggestion | None:
+    """The largest radius that the demonstration leaves before its phase ends; None if it doesn't.
+
+    In a contact there is no room at all.
+    """
+    if phases[t].contacts:
+        return Suggestion(0.0, 0.0, "contact " + " / ".join(min(phases[t].contacts)))
+    event = next((s for s in range(t, len(phases)) if phases[s] != phases[t]), None)
+    if event is None:
+        return None
+    p = demonstration.steps.measured_Ts_world_tool[t:event, :3, 3]
+    farthest = float(np.linalg.norm(p - p[0], axis=1).max())
+    what = phases[t].change(phases[event])
+    # A waypoint must lie outside of the sphere: a micrometre is left for that.
+    return Suggestion(max(0.0, farthest - 1e-6), 0.0, f"{what} at waypoint {event}")
 
 
 def suggest_annotation(
@@ -185,7 +238,8 @@ def suggest_annotation(
 
     Without `waypoints`, spheres tile the free part: the first at the start, each next one at the
     convergence waypoint of the one before, or at the first later waypoint with room for
-    `min_radius`.
+    `min_radius`. A sphere is no larger than lets the tool rejoin the demonstration before the next
+    grasp, release or contact; an object in the grasp counts as part of the tool.
 
     Args:
         demonstration: what was shown; it must hold the poses of the scene's bodies.
@@ -206,12 +260,21 @@ def suggest_annotation(
 
     steps = demonstration.steps
     last = len(demonstration) - 1
+    phases = _phases(demonstration, robot, scene)
 
     def sphere_at(t: int) -> tuple[Suggestion, PrecisionSphere | None]:
         T_key = steps.measured_Ts_world_tool[t]
         bodies = {name: Ts[t] for name, Ts in demonstration.body_Ts_world.items()}
         opening = clearances(round(float(steps.measured_gripper[t]), 2))
-        found = suggest_radius(opening, steps.joint_positions[t], T_key, bodies, config)
+        room = _room_before_event(demonstration, phases, t)
+        if room is not None and room.radius < config.min_radius:
+            found = room
+        else:
+            found = suggest_radius(
+                opening, steps.joint_positions[t], T_key, bodies, config, phases[t].carried
+            )
+            if room is not None and room.radius < found.radius:
+                found = dataclasses.replace(room, clearance=found.clearance)
         if progress is not None:
             progress(t)
         if found.radius < config.min_radius:

@@ -53,6 +53,7 @@ def _demonstration(positions):
         timestamps=np.arange(n) / 10,
         body_Ts_world={},
         success=np.zeros(n, bool),
+        touching=((),) * n,
         raw_commands=np.zeros((3 * n, 7)),
         states=(),
         operator="test",

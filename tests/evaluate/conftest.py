@@ -84,6 +84,7 @@ def make_dataset(task: str = "peg_in_hole", n_episodes: int = 12) -> Dataset:
         timestamps=0.1 * np.arange(41),
         body_Ts_world={"block": np.tile(pose((0.5, 0.0, 0.0)), (41, 1, 1))},
         success=s > 0.9,
+        touching=((),) * len(s),
         raw_commands=np.zeros((123, 7)),
         states=(),
         operator="scripted operator",

@@ -24,9 +24,14 @@ RADIUS = 0.01
 shifts = st.tuples(*[st.floats(-0.3, 0.3)] * 3).map(np.array)
 
 
+def tool_pairs(clearances, q, Ts_world_body):
+    """The nearest pair of each tool body."""
+    return [body.nearest for body in clearances.tool_clearances(q, Ts_world_body)]
+
+
 def of(pairs, link):
     """The distance of the nearest part of a link."""
-    return min(pair.distance for pair in pairs.values() if pair.a == link)
+    return min(pair.distance for pair in pairs if pair.a == link)
 
 
 @pytest.fixture(scope="session")
@@ -46,8 +51,8 @@ def peg_tip(peg_model, start):
 
 
 def test_the_peg_starts_12_5_cm_above_the_block(start):
-    pairs = start.clearances.tool_distances(start.state.q, start.state.Ts_world_body)
-    nearest = min(pairs.values(), key=lambda pair: pair.distance)
+    pairs = tool_pairs(start.clearances, start.state.q, start.state.Ts_world_body)
+    nearest = min(pairs, key=lambda pair: pair.distance)
     assert (nearest.a, nearest.b) == ("peg", "block")
     # Over the middle of the hole: 12.5 cm down to the rim, and 1 cm from peg to wall.
     assert nearest.distance == pytest.approx(np.hypot(0.125, 0.010), abs=1e-5)
@@ -55,14 +60,14 @@ def test_the_peg_starts_12_5_cm_above_the_block(start):
 
 def test_the_peg_above_a_wall_of_the_block_is_12_5_cm_from_it(start, peg_task, peg_model):
     state = peg_task.initial_state(peg_model, Placement(0.04, 0.0))
-    pairs = start.clearances.tool_distances(state.q, state.Ts_world_body)
+    pairs = tool_pairs(start.clearances, state.q, state.Ts_world_body)
     assert of(pairs, "peg") == pytest.approx(0.125, abs=1e-5)
 
 
 def test_the_peg_far_from_the_block_is_nearest_to_the_table(start):
     Ts = {**start.state.Ts_world_body, "block": pose([0, 0, -5])}
-    pairs = start.clearances.tool_distances(start.state.q, Ts)
-    assert {pair.b for pair in pairs.values()} == {"table"}
+    pairs = tool_pairs(start.clearances, start.state.q, Ts)
+    assert {pair.b for pair in pairs} == {"table"}
     assert of(pairs, "peg") == pytest.approx(0.165, abs=1e-5)
 
 
@@ -70,16 +75,14 @@ def test_the_peg_far_from_the_block_is_nearest_to_the_table(start):
 @given(gap=st.floats(0.001, 1))
 def test_a_ball_below_the_peg_is_as_far_as_its_gap(probed, start, peg_tip, gap):
     p = peg_tip - [0, 0, gap + RADIUS]
-    pairs = probed.tool_distances(start.state.q, {"ball": pose(p)})
+    pairs = tool_pairs(probed, start.state.q, {"ball": pose(p)})
     assert of(pairs, "peg") == pytest.approx(gap, abs=1e-6)
 
 
 def test_reach_is_the_distance_of_a_bodys_farthest_corner_from_the_tool(start):
-    clearances = start.clearances
-    pairs = clearances.tool_distances(start.state.q, start.state.Ts_world_body)
-    reach = {pair.a: clearances.tool_reach[i] for i, pair in pairs.items()}
+    bodies = start.clearances.tool_clearances(start.state.q, start.state.Ts_world_body)
+    reach = {body.nearest.a: body.reach for body in bodies}
     assert reach["peg"] == pytest.approx(np.sqrt(0.015**2 + 0.015**2 + 0.06**2), abs=1e-6)
-    assert set(clearances.tool_reach) == set(pairs)
 
 
 @pytest.mark.parametrize(
@@ -104,8 +107,9 @@ def test_reach_covers_a_body_of_any_kind_and_no_more_than_the_box_around_it(
 
     monkeypatch.setattr(pin, "buildGeomFromUrdf", with_another_peg)
     clearances = ClearanceModel(peg_model, peg_task.scene)
-    pairs = clearances.tool_distances(peg_model.spec.home, {"table": np.eye(4), "block": np.eye(4)})
-    (reach,) = [clearances.tool_reach[i] for i, pair in pairs.items() if pair.a == "peg"]
+    Ts = {"table": np.eye(4), "block": np.eye(4)}
+    bodies = clearances.tool_clearances(peg_model.spec.home, Ts)
+    (reach,) = [body.reach for body in bodies if body.nearest.a == "peg"]
     # The peg's centre is 2 cm beyond the tool's.
     assert farthest - 1e-9 <= reach <= np.linalg.norm(corner) + 1e-9
 
@@ -119,10 +123,10 @@ def test_no_distance_changes_by_more_than_a_body_moves(start, shift, step):
     q, Ts = start.state.q, start.state.Ts_world_body
     moved = pose(shift) @ Ts["block"]
     farther = pose(shift * (1 + step)) @ Ts["block"]
-    a = start.clearances.tool_distances(q, {**Ts, "block": moved})
-    b = start.clearances.tool_distances(q, {**Ts, "block": farther})
+    a = tool_pairs(start.clearances, q, {**Ts, "block": moved})
+    b = tool_pairs(start.clearances, q, {**Ts, "block": farther})
     length = np.linalg.norm(shift) * step
-    assert all(abs(a[i].distance - b[i].distance) <= length + 1e-6 for i in a)
+    assert all(abs(x.distance - y.distance) <= length + 1e-6 for x, y in zip(a, b, strict=True))
 
 
 def test_distances_only_grow_when_the_scene_moves_away_below(start):
@@ -130,8 +134,8 @@ def test_distances_only_grow_when_the_scene_moves_away_below(start):
     rows = []
     for drop in np.linspace(0, 0.5, 11):
         lower = {name: pose([0, 0, -drop]) @ T for name, T in Ts.items()}
-        pairs = start.clearances.tool_distances(q, lower)
-        rows.append([pairs[i].distance for i in pairs])
+        pairs = tool_pairs(start.clearances, q, lower)
+        rows.append([pair.distance for pair in pairs])
     assert (np.diff(rows, axis=0) > 0).all()
     arm = [
         start.clearances.arm_distance(q, {n: pose([0, 0, -drop]) @ T for n, T in Ts.items()})
@@ -144,12 +148,12 @@ def test_distances_only_grow_when_the_scene_moves_away_below(start):
 @given(inside=st.tuples(*[st.floats(-0.9, 0.9)] * 3))
 def test_a_ball_inside_the_peg_overlaps_it(probed, peg_model, start, inside):
     T = peg_model.fk(start.state.q, "peg") @ pose(np.array(inside) * [0.015, 0.015, 0.04])
-    assert of(probed.tool_distances(start.state.q, {"ball": T}), "peg") < 0
+    assert of(tool_pairs(probed, start.state.q, {"ball": T}), "peg") < 0
 
 
 def test_a_tool_in_the_table_overlaps_it(start):
     Ts = {**start.state.Ts_world_body, "table": pose([0, 0, 0.2])}
-    pairs = start.clearances.tool_distances(start.state.q, Ts)
+    pairs = tool_pairs(start.clearances, start.state.q, Ts)
     assert of(pairs, "peg") < 0
 
 
@@ -175,8 +179,8 @@ def test_every_corner_of_every_collision_mesh_is_enclosed(probed, peg_model, sta
     for link, vertices in collision_vertices(peg_model, q):
         for vertex in vertices[:: max(1, len(vertices) // 8)]:
             Ts = {"ball": pose(vertex)}
-            pairs = probed.tool_distances(q, Ts)
-            if link in {pair.a for pair in pairs.values()}:
+            pairs = tool_pairs(probed, q, Ts)
+            if link in {pair.a for pair in pairs}:
                 nearest = of(pairs, link)
                 seen.add(link)
             elif link != "base_link_inertia":
@@ -189,8 +193,8 @@ def test_every_corner_of_every_collision_mesh_is_enclosed(probed, peg_model, sta
 
 
 def test_tool_bodies_are_what_the_last_joint_carries(probed, start):
-    pairs = probed.tool_distances(start.state.q, {"ball": pose([5, 5, 5])})
-    links = {pair.a for pair in pairs.values()}
+    pairs = tool_pairs(probed, start.state.q, {"ball": pose([5, 5, 5])})
+    links = {pair.a for pair in pairs}
     assert {"peg", "wrist_camera", "gripper_left_inner_finger_pad", "wrist_3_link"} <= links
     assert links.isdisjoint({"forearm_link", "upper_arm_link", "wrist_1_link", "wrist_2_link"})
 
@@ -223,7 +227,7 @@ def test_a_shape_that_does_not_collide_is_not_near(peg_model, start):
     shapes = (Shape("sphere", (0.1,), collides=False), Shape("sphere", (0.01,), pose([0, 0, 3])))
     clearances = ClearanceModel(peg_model, SceneSpec((Body("ghost", shapes),)))
     T = pose((peg_model.fk(start.state.q))[:3, 3])
-    assert of(clearances.tool_distances(start.state.q, {"ghost": T}), "peg") > 2.5
+    assert of(tool_pairs(clearances, start.state.q, {"ghost": T}), "peg") > 2.5
 
 
 @pytest.mark.parametrize(
@@ -233,30 +237,47 @@ def test_a_shape_that_does_not_collide_is_not_near(peg_model, start):
 def test_every_kind_of_shape_is_as_large_as_it_says(peg_model, start, peg_tip, kind, size, reach):
     clearances = ClearanceModel(peg_model, SceneSpec((Body("thing", (Shape(kind, size),)),)))
     T = pose(peg_tip - [0, 0, 0.1 + reach])
-    pairs = clearances.tool_distances(start.state.q, {"thing": T})
+    pairs = tool_pairs(clearances, start.state.q, {"thing": T})
     assert of(pairs, "peg") == pytest.approx(0.1, abs=1e-5)
 
 
 def test_an_empty_scene_is_infinitely_far(peg_model, start):
     clearances = ClearanceModel(peg_model, SceneSpec(()))
-    pairs = clearances.tool_distances(start.state.q, {})
-    assert set(pairs) == set(clearances.tool_reach)
-    assert all(pair.distance == np.inf for pair in pairs.values())
+    pairs = tool_pairs(clearances, start.state.q, {})
+    assert pairs
+    assert all(pair.distance == np.inf for pair in pairs)
     assert clearances.arm_distance(start.state.q, {}).distance > 0.02
+
+
+def test_a_body_in_the_grasp_counts_as_the_tools_and_no_longer_as_the_scenes(peg_model, start):
+    shapes = (Shape("box", (0.02, 0.02, 0.06)),)
+    clearances = ClearanceModel(
+        peg_model, SceneSpec((Body("box", shapes, mass=0.1), Body("floor", shapes)))
+    )
+    T = peg_model.fk(start.state.q)
+    Ts = {"box": T @ pose([0, 0, 0.10]), "floor": T @ pose([0, 0, 0.20])}
+    q = start.state.q
+    assert {pair.b for pair in tool_pairs(clearances, q, Ts)} == {"box"}
+    bodies = clearances.tool_clearances(q, Ts, carried={"box"})
+    assert {body.nearest.b for body in bodies} == {"floor"}
+    (box,) = [body for body in bodies if body.nearest.a == "box"]
+    assert box.nearest.distance == pytest.approx(0.04, abs=1e-6)
+    assert box.reach == pytest.approx(np.sqrt(0.01**2 + 0.01**2 + 0.13**2), abs=1e-9)
+    assert clearances.arm_distance(q, Ts, {"box", "floor"}).b not in Ts
 
 
 # --- errors -------------------------------------------------------------------------------------
 
 
 def test_a_body_whose_pose_is_missing_is_told(start):
-    for ask in (start.clearances.tool_distances, start.clearances.arm_distance):
+    for ask in (start.clearances.tool_clearances, start.clearances.arm_distance):
         with pytest.raises(UnknownName, match="unknown body 'block': did you mean 'blok'"):
             ask(start.state.q, {"table": np.eye(4), "blok": np.eye(4)})
 
 
 @pytest.mark.parametrize("q", [np.zeros(5), np.full(6, np.nan)], ids=["short", "NaN"])
 def test_joints_that_are_no_configuration_are_refused(start, q):
-    for ask in (start.clearances.tool_distances, start.clearances.arm_distance):
+    for ask in (start.clearances.tool_clearances, start.clearances.arm_distance):
         with pytest.raises(InvalidInput, match="q: "):
             ask(q, start.state.Ts_world_body)
 

@@ -121,8 +121,9 @@ def test_what_limits_a_radius_is_a_pair_at_the_stated_clearance(
     for sphere in peg_annotation.spheres:
         t = sphere.waypoint
         bodies = {name: Ts[t] for name, Ts in peg_demonstration.body_Ts_world.items()}
-        pairs = clearances(t).tool_distances(peg_demonstration.steps.joint_positions[t], bodies)
-        stated = {f"{pair.a} / {pair.b}": pair.distance for pair in pairs.values()}
+        q = peg_demonstration.steps.joint_positions[t]
+        pairs = [body.nearest for body in clearances(t).tool_clearances(q, bodies)]
+        stated = {f"{pair.a} / {pair.b}": pair.distance for pair in pairs}
         assert stated[sphere.limited_by] == pytest.approx(sphere.clearance, abs=5e-4)
         assert sphere.radius < sphere.clearance - SuggestConfig().margin + 1e-12
 
@@ -142,7 +143,7 @@ def test_every_pose_that_augmentation_draws_keeps_tool_and_arm_clear(
             drawn = dataclasses.replace(sphere, radius=max(radius, 1e-6))
             T = sart(peg_demonstration, drawn, rng, SamplingConfig()).T_world_sampled
             q = model.model.ik(T, peg_demonstration.steps.joint_positions[t])
-            tool = min(pair.distance for pair in model.tool_distances(q, bodies).values())
+            tool = min(body.nearest.distance for body in model.tool_clearances(q, bodies))
             # The gripper's opening is rounded to a hundredth for the certificate.
             assert tool >= margin - 5e-4
             assert model.arm_distance(q, bodies).distance >= 0
