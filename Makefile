@@ -15,9 +15,9 @@ PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c const
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /\t/' | expand -t 12
 
-setup: $(VENV)/.setup ## install the toolkit and what its tests need into .venv
+setup: $(VENV)/.setup ## install the toolkit, both simulators and what the tests need into .venv
 
-setup-all: $(VENV)/.setup-all ## add SAPIEN, the annotation window and planning, with their Debian libraries
+setup-all: $(VENV)/.setup-all ## add the annotation window and planning, with their Debian libraries
 
 demo: setup ## learn peg-in-hole from one demonstration and write a report
 	$(BIN)/sart run peg_in_hole --out $(DEMO_OUT)
@@ -38,17 +38,18 @@ clean: ## remove .venv, caches and build products, but not runs/
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
-	@groups=core; $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || groups="python core"; \
+	@groups="core sapien"; \
+	    $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || groups="python $$groups"; \
 	    bash tools/setup_debian.sh $$groups
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
 	    echo "sart_toolkit needs Python 3.11, but '$(PYTHON) --version' says:" \
 	        "$$($(PYTHON) --version 2>&1). Type: make $(MAKECMDGOALS)" \
 	        "PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(PIP_INSTALL) -e '.[dev]'
+	$(PIP_INSTALL) -e '.[dev,sapien]'
 	@touch $@
 
 $(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh
-	bash tools/setup_debian.sh sapien annotate
+	bash tools/setup_debian.sh annotate
 	$(PIP_INSTALL) -e '.[dev,sapien,annotate,planning]'
 	@touch $@

@@ -74,6 +74,7 @@ def library_versions() -> dict[str, str]:
         "coal",
         "ruckig",
         "pybullet",
+        "sapien",
         "torch",
         "safetensors",
         "h5py",

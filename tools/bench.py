@@ -23,7 +23,8 @@ import torch
 
 from sart_toolkit import doctor
 from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
-from sart_toolkit.backends import make_backend
+from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.backends.interface import Backend
 from sart_toolkit.errors import SartError, unknown_name
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.learn.training import (
@@ -35,8 +36,10 @@ from sart_toolkit.learn.training import (
     train,
 )
 from sart_toolkit.learn.windows import Batch, build_windows
-from sart_toolkit.poses import check_positive, pose
+from sart_toolkit.motion.controller import ToolController
+from sart_toolkit.poses import apply_motion, check_positive, pose
 from sart_toolkit.records import (
+    CONTROL_HZ,
     Annotation,
     CameraRecord,
     Dataset,
@@ -50,7 +53,7 @@ from sart_toolkit.records import (
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import TASKS, get_task
-from sart_toolkit.tasks.task import Placement
+from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
 from sart_toolkit.teach.suggest import suggest_annotation
@@ -278,10 +281,79 @@ def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
     }
 
 
+# --- control steps ------------------------------------------------------------------------------
+
+
+def bench_step(arguments: Sequence[str]) -> dict[str, Any]:
+    """Control steps/s with an RGB-D picture at each, by task and backend, and the parts' costs.
+
+    The scripted operator carries out its demonstration; only what the backend does is counted:
+    measuring, drawing the wrist camera's picture, and 1/30 s of physics. One thread.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py step", description=bench_step.__doc__)
+    parser.add_argument("--tasks", default="all", help=f"all, or {','.join(TASKS)}")
+    parser.add_argument("--backends", default="all", help=f"all, or {','.join(BACKENDS)}")
+    parser.add_argument("--image-size", type=int, default=128, help="[pixels]")
+    parser.add_argument("--repeats", type=int, default=3, help="demonstrations, for the median")
+    options = parser.parse_args(arguments)
+    check_positive("--repeats", options.repeats)
+    tasks = list(TASKS) if options.tasks == "all" else options.tasks.split(",")
+    backends = list(BACKENDS) if options.backends == "all" else options.backends.split(",")
+    figures: dict[str, Any] = {}
+    for name in tasks:
+        task = get_task(name)
+        robot = get_robot(task.robot)
+        for kind in backends:
+            backend = make_backend(kind, robot, task.scene, options.image_size)
+            turns = [_drive(backend, task, turn) for turn in range(options.repeats)]
+            backend.close()
+            medians = np.median(turns, axis=0)
+            figures[f"{name}/{kind}"] = {
+                "control_steps_per_second": 1 / medians.sum(),
+                "picture_ms": medians[0] * 1e3,
+                "physics_ms": medians[1] * 1e3,
+            }
+            _say(f"{name}/{kind}: {1 / medians.sum():.0f} control steps/s")
+    return {
+        "image_size": options.image_size,
+        "repeats": options.repeats,
+        "cells": figures,
+        "slowest": {
+            kind: min(figures[f"{name}/{kind}"]["control_steps_per_second"] for name in tasks)
+            for kind in backends
+        },
+    }
+
+
+def _drive(backend: Backend, task: Task, seed: int) -> tuple[float, float]:
+    """Mean seconds of a picture and of a control period's physics in one demonstration."""
+    model = RobotModel(backend.robot, task.scene.held)
+    state = task.initial_state(model, Placement())
+    operator = ScriptedOperator(task.plan(state), np.random.default_rng(seed))
+    controller = ToolController(model)
+    backend.reset(state)
+    controller.reset(state.q)
+    picture, physics = [], []
+    while True:
+        started = time.perf_counter()
+        seen = backend.observe(("wrist",))
+        picture.append(time.perf_counter() - started)
+        command = operator.read(seen)
+        if command.stop:
+            return statistics.mean(picture), statistics.mean(physics)
+        desired = apply_motion(controller.commanded_T_world_tool, command.velocity / CONTROL_HZ)
+        q = controller.move(desired, seen.T_world_tool, 1)[0]
+        started = time.perf_counter()
+        backend.command(q, command.gripper)
+        backend.step()
+        physics.append(time.perf_counter() - started)
+
+
 # --- the table, the machine ---------------------------------------------------------------------
 
 BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "augment": bench_augment,
+    "step": bench_step,
     "train": bench_train,
 }
 

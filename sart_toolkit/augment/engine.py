@@ -8,7 +8,7 @@ import functools
 import json
 import logging
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -139,7 +139,6 @@ def try_segment(
     gripper = float(steps.commanded_gripper[t_star])
     scene = backend.scene
     carried = scene.grasped(demonstration.touching[t_star], backend.robot.gripper.finger_links)
-    standing = {body.name for body in scene.bodies} - carried
     controller = ToolController(model)
     try:
         line = straight_line(model, q_start, T_start, proposal.T_world_sampled, config.duration)
@@ -152,9 +151,9 @@ def try_segment(
             for q in controller.move(desired, measured, CONTROL_PER_RECORD):
                 backend.command(q, gripper)
                 backend.step()
-                for touch in backend.contacts():
-                    if _unwanted({touch.a, touch.b}, standing, carried):
-                        return Attempt(f"contact {touch.a} / {touch.b}", None)
+                hits = _hits(backend, carried)
+                if hits:
+                    return Attempt(f"contact {hits[0][0]} / {hits[0][1]}", None)
             if not np.allclose(controller.commanded_T_world_tool, desired, rtol=0, atol=1e-9):
                 return Attempt("tool lags behind the line", None)
             measured = recorder.add(controller, gripper, 0.0).T_world_tool
@@ -179,13 +178,12 @@ def try_segment(
     return Attempt(KEPT, Episode(recorder.steps(slice(None, None, -1)), provenance))
 
 
-def _unwanted(pair: set[str], standing: set[str], carried: Collection[str]) -> bool:
-    """Whether two bodies that touch should not: the robot, with what it carries, and the rest."""
-    there = len(pair & standing)
-    if there == 0:
-        # Within the robot only a grasp is meant.
-        return pair.isdisjoint(carried)
-    return there == 1
+def _hits(backend: Backend, carried: frozenset[str]) -> list[tuple[str, str]]:
+    """Contacts of the last step that should not be: of the robot with itself, and outer ones."""
+    touching = [(contact.a, contact.b) for contact in backend.contacts()]
+    bodies = {body.name for body in backend.scene.bodies}
+    itself = [pair for pair in touching if bodies.isdisjoint(pair)]
+    return sorted([*itself, *backend.scene.outer_contacts(touching, carried)])
 
 
 def _slipped(name: str, start: Observation, end: Observation) -> bool:

@@ -18,13 +18,19 @@ _VERSION = 3
 
 
 def scene_digest(model: RobotModel, scene: SceneSpec) -> str:
-    """A hash of robot, shapes, joints and gravity, but not of where bodies stand: that is state.
+    """A hash of robot, shapes, joints and gravity; not of looks, nor of where bodies stand.
 
     Args:
         model: the robot with what it holds.
         scene: what surrounds it.
     """
-    what = [(b.name, b.shapes, b.mass, b.friction, b.joint) for b in scene.bodies]
+    what = [
+        (
+            [(s.kind, s.size, s.T_body_shape, s.collides) for s in body.shapes],
+            (body.name, body.mass, body.friction, body.joint),
+        )
+        for body in scene.bodies
+    ]
     with np.printoptions(precision=17, floatmode="unique", threshold=10**6):
         text = repr((what, scene.gravity))
     return hashlib.sha256(text.encode() + model.urdf.read_bytes()).hexdigest()

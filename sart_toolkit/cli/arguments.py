@@ -24,6 +24,12 @@ _POLICY = Annotated[str, arg(help="Policy: compact_mlp, or resnet18_mlp as in th
 _N = Annotated[int, arg(help="Trajectories in all, the demonstration among them.")]
 _EPISODES = Annotated[int, arg(help="Rollouts with random placements.")]
 _EVAL_SEED = Annotated[int, arg(help="Seed of the placements, apart from training's.")]
+_YAW = Annotated[
+    float, arg(help="Also turn the object, uniformly within ± this [deg]; the paper does not.")
+]
+_LOOKS = Annotated[bool, arg(help="Vary colours, light and the wrist camera's mounting at random.")]
+_TASKS = Annotated[str, arg(help="Names of tasks with commas between, or all.")]
+_BACKENDS = Annotated[str, arg(help="Names of backends with commas between, or all.")]
 _LAW = Annotated[
     Literal["paper", "area"],
     arg(help="How positions are drawn on a sphere: as the paper says, or uniform over its area."),
@@ -65,7 +71,9 @@ class Record:
 
     Example: sart record peg_in_hole --out demo.h5
 
-    Example: sart record peg_in_hole --out demo.h5 --seed 3 --placement random
+    Example: sart record toolbox_picking --out demo.h5 --backend sapien
+
+    Example: sart record peg_in_hole --out demo.h5 --seed 3 --placement random --yaw-deg 10
     """
 
     task: _TASK
@@ -76,6 +84,8 @@ class Record:
     placement: Annotated[
         Literal["middle", "random"], arg(help="Where the object stands in its range.")
     ] = "middle"
+    yaw_deg: _YAW = 0.0
+    vary_looks: _LOOKS = False
     image_size: _IMAGE = 128
     overwrite: _OVERWRITE = False
     json: _JSON = False
@@ -178,6 +188,8 @@ class Evaluate:
     """Try a skill on random placements.
 
     Example: sart evaluate skill --out evaluation.json --episodes 100 --workers 2
+
+    Example: sart evaluate skill --out looks.json --vary-looks --yaw-deg 15
     """
 
     skill: Annotated[Positional[Path], arg(metavar="SKILL", help="Directory from `sart train`.")]
@@ -185,10 +197,74 @@ class Evaluate:
     backend: Annotated[str | None, arg(help="Backend; the demonstration's if left out.")] = None
     episodes: _EPISODES = 50
     eval_seed: _EVAL_SEED = 1000
+    yaw_deg: _YAW = 0.0
+    vary_looks: _LOOKS = False
     videos: Annotated[int, arg(help="Videos of the first successes, and as many of failures.")] = 2
     workers: _WORKERS = 2
     device: _DEVICE = "cpu"
     overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class BenchmarkOperator:
+    """How often the scripted operator reaches the goal, on each task and backend.
+
+    Example: sart benchmark operator --tasks all --backends pybullet,sapien --episodes 100
+        --out operator.json
+
+    Interrupted, it goes on where it was when the same command is typed again.
+    """
+
+    tasks: _TASKS = "all"
+    backends: _BACKENDS = "all"
+    episodes: Annotated[int, arg(help="Episodes with random placements, a task and backend.")] = 100
+    seed: _SEED = 0
+    yaw_deg: _YAW = 0.0
+    out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_operator.json")
+    workers: _WORKERS = 2
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class BenchmarkReplay:
+    """How a demonstration recorded on one backend fares when its commands are given on another.
+
+    Example: sart benchmark replay --tasks all --backends pybullet,sapien --out replay.json
+    """
+
+    tasks: _TASKS = "all"
+    backends: _BACKENDS = "all"
+    seed: _SEED = 0
+    out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_replay.json")
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class BenchmarkSkill:
+    """How well a skill learned from one demonstration does, on each task and backend.
+
+    Each is a `sart run` of its own, in OUT/TASK-BACKEND; the figures are collected in
+    OUT/benchmark.json.
+
+    Example: sart benchmark skill --tasks peg_in_hole,toolbox_picking --backends all
+        --out runs/skills --episodes 20
+
+    Interrupted, it goes on where it was when the same command is typed again.
+    """
+
+    out: Annotated[Path, arg(help="Directory to write.")]
+    tasks: _TASKS = "all"
+    backends: _BACKENDS = "all"
+    policy: _POLICY = "compact_mlp"
+    n: _N = 40
+    episodes: _EPISODES = 20
+    seed: _SEED = 0
+    eval_seed: _EVAL_SEED = 1000
+    workers: _WORKERS = 2
+    device: _DEVICE = "auto"
     json: _JSON = False
 
 
@@ -223,6 +299,14 @@ Verb = (
     | Annotated[Augment, tyro.conf.subcommand("augment")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[
+        Annotated[BenchmarkOperator, tyro.conf.subcommand("operator")]
+        | Annotated[BenchmarkReplay, tyro.conf.subcommand("replay")]
+        | Annotated[BenchmarkSkill, tyro.conf.subcommand("skill")],
+        tyro.conf.subcommand(
+            "benchmark", description="Measure operator, backends or skills over many tasks."
+        ),
+    ]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )

@@ -9,6 +9,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.cli.arguments import (
     Augment,
+    BenchmarkOperator,
+    BenchmarkReplay,
+    BenchmarkSkill,
     Evaluate,
     Info,
     Record,
@@ -30,6 +34,12 @@ from sart_toolkit.cli.arguments import (
 )
 from sart_toolkit.cli.console import progress_bar, say, show
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
+from sart_toolkit.evaluate.benchmark import (
+    BenchmarkConfig,
+    Cell,
+    benchmark_operator,
+    benchmark_replay,
+)
 from sart_toolkit.evaluate.report import write_report
 from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
 from sart_toolkit.learn.skill import load_skill, save_skill
@@ -37,6 +47,7 @@ from sart_toolkit.learn.training import TrainConfig, train
 from sart_toolkit.records import Dataset, Demonstration, library_versions
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.appearance import vary_appearance
 from sart_toolkit.storage import (
     check_writable,
     clear_directory,
@@ -49,7 +60,7 @@ from sart_toolkit.storage import (
     save_demonstration,
     write_json,
 )
-from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
@@ -86,21 +97,27 @@ def _image_size(demonstration: Demonstration) -> int:
 def record_verb(args: Record) -> Result:
     """`sart record`."""
     task = get_task(args.task)
-    robot = get_robot(args.robot or task.robot)
     make = _backend_factory(args.backend, task, args.robot, args.image_size)
     check_writable(args.out, args.overwrite)
+    if args.vary_looks:
+        looks = np.random.default_rng([args.seed, 1])
+        varied = vary_appearance(get_robot(args.robot or task.robot), task.scene, looks)
+        make = functools.partial(make_backend, args.backend, *varied, args.image_size)
     rng = np.random.default_rng(args.seed)
-    placement = Placement() if args.placement == "middle" else task.sample_placement(rng)
-    model = RobotModel(robot, task.scene.held)
-    device = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
-    backend = make()
-    with progress_bar("record", None, "s") as bar:
-        demonstration = record_demonstration(
-            backend, task, model, device, placement, args.seed,
-            progress=lambda seconds: bar.update(seconds - bar.n),
-        )  # fmt: skip
-    backend.close()
-    if not demonstration.success[-1]:
+    placement = Placement()
+    if args.placement == "random":
+        placement = task.sample_placement(rng, args.yaw_deg)
+    elif args.yaw_deg:
+        raise InvalidInput("--yaw-deg: turns random placements only; add --placement random")
+    with closing(make()) as backend:
+        model = RobotModel(backend.robot, backend.scene.held)
+        device = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
+        with progress_bar("record", None, "s") as bar:
+            demonstration = record_demonstration(
+                backend, task, model, device, placement, args.seed,
+                progress=lambda seconds: bar.update(seconds - bar.n),
+            )  # fmt: skip
+    if not task.achieved(demonstration.success):
         raise Mismatch("the demonstration did not reach the goal; record again with another --seed")
     save_demonstration(args.out, demonstration)
     return {"demonstration": str(args.out), **_describe_demonstration(demonstration)}
@@ -207,7 +224,9 @@ def evaluate_verb(args: Evaluate) -> Result:
     """`sart evaluate`."""
     skill = load_skill(args.skill)
     task = get_task(skill.config.task)
-    config = EvaluateConfig(args.episodes, args.eval_seed, args.videos)
+    config = EvaluateConfig(
+        args.episodes, args.eval_seed, args.videos, args.yaw_deg, args.vary_looks
+    )
     make = _backend_factory(
         args.backend or skill.config.backend,
         task,
@@ -304,6 +323,86 @@ def run_whole(args: Run) -> Result:
         "seconds": round(sum(state["stages"].values()), 1),
         "skill": str(skill),
         "report": str(report),
+    }
+
+
+def _cells(tasks: str, backends: str) -> list[Cell]:
+    """Every task of one list on every backend of the other."""
+    names = list(TASKS) if tasks == "all" else tasks.split(",")
+    where = list(BACKENDS) if backends == "all" else backends.split(",")
+    return [
+        Cell(task, backend, _backend_factory(backend, task, None, 128))
+        for task in map(get_task, names)
+        for backend in where
+    ]
+
+
+def benchmark_operator_verb(args: BenchmarkOperator) -> Result:
+    """`sart benchmark operator`."""
+    cells = _cells(args.tasks, args.backends)
+    config = BenchmarkConfig(args.episodes, args.seed, args.yaw_deg)
+    with progress_bar("operator", len(cells) * args.episodes, "episode") as bar:
+
+        def progress(done: int, wanted: int, successes: int) -> None:
+            bar.set_postfix_str(f"{successes}/{done} succeeded", refresh=False)
+            bar.update(done - bar.n)
+
+        result = benchmark_operator(cells, config, args.out, args.workers, args.overwrite, progress)
+    return {"benchmark": str(args.out)} | {
+        name: _rate(row) + f", {row['median_seconds']:.1f} s"
+        for name, row in result["cells"].items()
+    }
+
+
+def _rate(row: Result) -> str:
+    low, high = (100 * end for end in row["ci95"])
+    return f"{row['n_success']}/{row['n_episodes']} (95 % interval {low:.0f} to {high:.0f} %)"
+
+
+def benchmark_replay_verb(args: BenchmarkReplay) -> Result:
+    """`sart benchmark replay`."""
+    cells = _cells(args.tasks, args.backends)
+    check_writable(args.out, args.overwrite)
+    with progress_bar("replay", None, "replay") as bar:
+
+        def progress(done: int, wanted: int) -> None:
+            bar.total = wanted
+            bar.update(done - bar.n)
+
+        result = benchmark_replay(cells, args.seed, progress)
+    write_json(args.out, result)
+    return {"benchmark": str(args.out)} | {
+        f"{row['task']}: {row['recorded_on']} to {row['replayed_on']}": (
+            f"{'success' if row['replayed_success'] else row['reason']}, "
+            f"{row['tool_difference_mm']:.2f} mm and {row['tool_difference_deg']:.2f} deg apart "
+            f"over {row['steps_compared']} of {row['steps']} steps"
+        )
+        for row in result["replays"]
+    }
+
+
+def benchmark_skill_verb(args: BenchmarkSkill) -> Result:
+    """`sart benchmark skill`: one `sart run` after the other, then their figures."""
+    rows: Result = {}
+    for cell in _cells(args.tasks, args.backends):
+        say(f"{cell.name}:")
+        run = run_whole(
+            Run(
+                cell.task.name, args.out / f"{cell.task.name}-{cell.backend}", cell.backend,
+                policy=args.policy, n=args.n, episodes=args.episodes, seed=args.seed,
+                eval_seed=args.eval_seed, workers=args.workers, device=args.device,
+            )
+        )  # fmt: skip
+        evaluation = read_json(args.out / f"{cell.task.name}-{cell.backend}" / "evaluation.json")
+        rows[cell.name] = {
+            key: evaluation[key] for key in ("n_success", "n_episodes", "success_rate", "ci95")
+        } | {key: run[key] for key in ("kept", "attempted", "stages_seconds")}
+        write_json(
+            args.out / "benchmark.json",
+            {"config": _plain(args), "cells": rows, "versions": library_versions()},
+        )
+    return {"benchmark": str(args.out / "benchmark.json")} | {
+        name: _rate(row) for name, row in rows.items()
     }
 
 
@@ -404,5 +503,8 @@ _VERBS: dict[type, Callable[[Any], Result]] = {
     Augment: augment_verb,
     Train: train_verb,
     Evaluate: evaluate_verb,
+    BenchmarkOperator: benchmark_operator_verb,
+    BenchmarkReplay: benchmark_replay_verb,
+    BenchmarkSkill: benchmark_skill_verb,
     Info: info_verb,
 }

@@ -27,6 +27,7 @@ from sart_toolkit.records import (
     library_versions,
 )
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.appearance import vary_appearance
 from sart_toolkit.storage import write_json
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.workers import worker_map
@@ -36,11 +37,17 @@ _OVERVIEW, _VIDEO_SIZE = "overview", 384
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """How a skill is tried: number of rollouts, their seed, and how many videos of each outcome."""
+    """How a skill is tried: number of rollouts, their seed, and how many videos of each outcome.
+
+    `yaw_deg`: objects are also turned, uniformly within ± this [deg]; with `vary_looks` colours,
+    light and camera mounting differ from rollout to rollout (`AppearanceConfig`'s defaults).
+    """
 
     episodes: int = 50
     eval_seed: int = 1000
     videos: int = 2
+    yaw_deg: float = 0.0
+    vary_looks: bool = False
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
@@ -76,9 +83,9 @@ class Rollout:
         }
 
 
-def episode_placement(task: Task, eval_seed: int, episode: int) -> Placement:
+def episode_placement(task: Task, eval_seed: int, episode: int, yaw_deg: float = 0.0) -> Placement:
     """The placement of an episode, drawn from its own generator."""
-    return task.sample_placement(np.random.default_rng([eval_seed, episode]))
+    return task.sample_placement(np.random.default_rng([eval_seed, episode]), yaw_deg)
 
 
 def run_rollout(
@@ -150,23 +157,29 @@ class _Worker:
         skill_directory: Path,
         task: Task,
         make_backend: BackendFactory,
-        seed: int,
+        config: EvaluateConfig,
         device: str,
         threads: int | None,
     ) -> None:
         if threads is not None:
             torch.set_num_threads(threads)
         self.skill = load_skill(skill_directory, device)
-        self.task, self.seed = task, seed
+        self.task, self.config = task, config
         self.backend = make_backend()
         self.model = RobotModel(self.backend.robot, self.backend.scene.held)
 
     def __call__(
         self, episode: int, watch: Callable[[Image, int, bool], None] | None = None
     ) -> Rollout:
-        placement = episode_placement(self.task, self.seed, episode)
+        seed = self.config.eval_seed
+        placement = episode_placement(self.task, seed, episode, self.config.yaw_deg)
+        if self.config.vary_looks:
+            rng = np.random.default_rng([seed, episode, 1])
+            robot, scene = vary_appearance(self.model.spec, self.task.scene, rng)
+            self.backend.close()
+            self.backend = type(self.backend)(robot, scene, self.backend.image_size)
         return run_rollout(
-            self.skill, self.task, self.backend, self.model, placement, (self.seed, episode), watch
+            self.skill, self.task, self.backend, self.model, placement, (seed, episode), watch
         )
 
     def close(self) -> None:
@@ -207,7 +220,7 @@ def evaluate_skill(
         skill_directory,
         task,
         make_backend,
-        config.eval_seed,
+        config,
         device,
     )
     started = time.perf_counter()

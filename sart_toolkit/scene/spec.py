@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -260,6 +260,18 @@ class SceneSpec:
         pairs = {pair for a, b in touching for pair in ((a, b), (b, a))}
         fingers = Counter(b for a, b in pairs if a in finger_links and b in free)
         return frozenset(name for name, count in fingers.items() if count >= 2)
+
+    def outer_contacts(
+        self, touching: Iterable[tuple[str, str]], carried: Collection[str]
+    ) -> frozenset[tuple[str, str]]:
+        """Those pairs in which the robot, or what it carries, touches what it doesn't carry.
+
+        Args:
+            touching: pairs of names that touch.
+            carried: names of bodies in the gripper's grasp.
+        """
+        standing = {body.name for body in self.bodies}.difference(carried)
+        return frozenset(pair for pair in touching if len(standing.intersection(pair)) == 1)
 
     def check_state(self, state: SceneState) -> None:
         """Refuse a state that isn't one of this scene; the robot's joints are not looked at.

@@ -8,10 +8,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, pose
+from sart_toolkit.records import RECORD_HZ
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scene.spec import SceneSpec, SceneState
 
@@ -109,6 +111,14 @@ class Task(abc.ABC):
     @abc.abstractmethod
     def plan(self, state: SceneState) -> list[Stage]:
         """The legs by which a person would steer the tool from the start to the goal."""
+
+    def achieved(self, success: NDArray[np.bool_]) -> bool:
+        """Whether the goal was reached at the end and had been for `hold` seconds.
+
+        Args:
+            success: `(T,)`, whether it was reached at each 10 Hz step.
+        """
+        return bool(np.all(success[-max(1, round(self.hold * RECORD_HZ)) :]))
 
     def sample_placement(self, rng: np.random.Generator, yaw_deg: float = 0.0) -> Placement:
         """A placement drawn uniformly from the square of half width `placement_range`.

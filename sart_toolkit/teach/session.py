@@ -63,10 +63,14 @@ class Device(abc.ABC):
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """How a demonstration is recorded: cameras, and the longest it may last [s]."""
+    """How a demonstration is recorded: cameras, and the longest it may last [s].
+
+    Without `keep_states` no generated trajectory can start from it, and recording is faster.
+    """
 
     cameras: tuple[str, ...] = ("wrist",)
     max_seconds: float = 120.0
+    keep_states: bool = True
 
     def __post_init__(self) -> None:
         check_positive("max_seconds", self.max_seconds, "s")
@@ -107,7 +111,8 @@ def record_demonstration(
     controller.reset(state.q)
     recorder = StepRecorder(backend, config.cameras)
     gripper = state.commanded_gripper
-    can_save, feels = backend.capabilities.can_restore, backend.capabilities.has_contacts
+    can_save = backend.capabilities.can_restore and config.keep_states
+    feels = backend.capabilities.has_contacts
     observation = recorder.add(controller, gripper, 0.0 if feels else np.nan)
     states = [backend.save()] if can_save else []
     success, raw = [task.success(observation)], []

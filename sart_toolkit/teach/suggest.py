@@ -196,12 +196,10 @@ class _Phase:
 
 def _phases(demonstration: Demonstration, robot: RobotSpec, scene: SceneSpec) -> list[_Phase]:
     commands = demonstration.steps.commanded_gripper
-    standing = {body.name for body in scene.bodies}
     phases = []
     for command, touching in zip(commands, demonstration.touching, strict=True):
         carried = scene.grasped(touching, robot.gripper.finger_links)
-        # A contact counts where the robot, or what it carries, touches what it doesn't carry.
-        contacts = frozenset(pair for pair in touching if len({*pair} & (standing - carried)) == 1)
+        contacts = scene.outer_contacts(touching, carried)
         phases.append(_Phase(round(float(command), 2), carried, contacts))
     # Before the first step nothing has been felt yet.
     return [dataclasses.replace(phases[1], gripper=phases[0].gripper), *phases[1:]]
