@@ -61,11 +61,9 @@ def _strip(name: str, seed: int) -> Image.Image:
             camera = "wrist" if column < _MOMENTS else "overview"
             left = column * (_SIZE + _GAP)
             page.paste(Image.fromarray(shown.steps.cameras[camera].rgb[t]), (left, top + _LABEL))
-            text = (
-                f"{shown.timestamps[t]:.1f} s" if camera == "wrist" else "from outside, at the end"
-            )
+            text = f"{backend}, {shown.timestamps[t]:.1f} s"
+            text = text if camera == "wrist" else "from outside, at the end"
             draw.text((left + 2, top + 3), text, fill="black", font=font)
-        draw.text((45, top + 3), f"{name} on {backend}", fill="black", font=font)
     return page
 
 
