@@ -299,14 +299,19 @@ class PyBulletBackend(Backend):
         self._time += 1.0 / CONTROL_HZ
 
     def _collect_contacts(self) -> None:
+        forces: dict[tuple[str, str], float] = {}
         for point in self._client.getContactPoints():
             distance, force = point[8], point[9]
             if distance > 0.0 and force <= 0.0:
                 continue
             a, b = self._names[point[1], point[3]], self._names[point[2], point[4]]
             pair = (a, b) if a <= b else (b, a)
-            old = self._touched.get(pair, (0.0, 0.0))
-            self._touched[pair] = (max(old[0], force), max(old[1], -distance))
+            forces[pair] = forces.get(pair, 0.0) + force
+            greatest, deepest = self._touched.get(pair, (0.0, 0.0))
+            self._touched[pair] = (greatest, max(deepest, -distance))
+        for pair, force in forces.items():
+            greatest, deepest = self._touched[pair]
+            self._touched[pair] = (max(greatest, force), deepest)
 
     def contacts(self) -> list[Contact]:
         return [Contact(a, b, *values) for (a, b), values in sorted(self._touched.items())]

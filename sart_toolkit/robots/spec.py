@@ -161,7 +161,9 @@ class GripperSpec:
     The command is 0 open, 1 closed. `driver` is the joint that the motor moves, from 0 to
     `closed_position` ([rad], or [m] where it slides); `followers` maps each linked joint to its
     ratio to the driver. `finger_links` are the links that may touch what is grasped. `force`
-    ([N m] or [N]) and `speed` ([rad/s] or [m/s]) bound the driver.
+    ([N m] or [N]) and `speed` ([rad/s] or [m/s]) bound the driver. `armature` ([kg m²] or [kg]) is
+    the drive's inertia as felt at each joint, through its gears: links of a few grams alone would
+    hold a heavy object badly in any simulator.
     """
 
     urdf: str
@@ -173,6 +175,7 @@ class GripperSpec:
     T_parent_gripper: Array = field(default_factory=lambda: np.eye(4))
     force: float = 20.0
     speed: float = 2.0
+    armature: float = 0.0
 
     def joint_positions(self, command: float) -> dict[str, float]:
         """Every linkage joint's position [rad or m] at a command in [0, 1]."""

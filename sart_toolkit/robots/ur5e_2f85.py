@@ -21,6 +21,9 @@ SPEC = ur5e_with(
         },
         closed_position=0.8,
         finger_links=("gripper_left_inner_finger_pad", "gripper_right_inner_finger_pad"),
+        # 50 N at each pad; the data sheet has 20 to 235 N.
+        force=6.0,
+        armature=1e-3,
     ),
     T_gripper_tool=pose([0, 0, 0.145]),
     link_colours={

@@ -33,7 +33,7 @@ from sart_toolkit.robots.spec import (
 )
 
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 9
+_RECIPE = 10
 _ARM_FACES, _GRIPPER_FACES = 150, 300
 _GRIPPER_PREFIX = "gripper_"
 
@@ -131,6 +131,7 @@ def _compose(
     robot.append(ET.Element("link", name=spec.tool_frame))
     for body in attachments:
         robot.append(rigid_link(body.name, body.shapes, body.mass))
+    _add_armature(robot, spec)
     for kind in ("link", "joint"):
         names = [element.get("name") for element in robot.findall(kind)]
         twice = sorted({str(name) for name in names if names.count(name) > 1})
@@ -146,6 +147,27 @@ def _compose(
             link.append(_inertial(1e-3, np.zeros(3), 1e-6 * np.eye(3)))
     ET.indent(robot)
     ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)
+
+
+def _add_armature(robot: ET.Element, spec: RobotSpec) -> None:
+    """Give what the gripper's joints move at least the inertia of the drive behind them."""
+    moving = spec.gripper.joint_positions(0.0)
+    links = {link.get("name"): link for link in robot.findall("link")}
+    for joint in robot.findall("joint"):
+        child = joint.find("child")
+        if joint.get("name") not in moving or child is None or not spec.gripper.armature:
+            continue
+        inertial = links[child.get("link")].find("inertial")
+        assert inertial is not None
+        part, names = (
+            ("mass", ["value"])
+            if joint.get("type") == "prismatic"
+            else ("inertia", ["ixx", "iyy", "izz"])
+        )
+        element = inertial.find(part)
+        assert element is not None
+        for name in names:
+            element.set(name, f"{max(float(element.get(name, 0)), spec.gripper.armature):.9g}")
 
 
 def _elements(source: Path, prefix: str) -> list[ET.Element]:
