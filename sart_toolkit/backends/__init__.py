@@ -12,6 +12,7 @@ from sart_toolkit.tables import lookup
 
 BACKENDS = {
     "pybullet": "sart_toolkit.backends.pybullet:PyBulletBackend",
+    "sapien": "sart_toolkit.backends.sapien:SapienBackend",
 }
 
 
