@@ -33,6 +33,7 @@ def ur5e_with(
     gripper: GripperSpec,
     T_gripper_tool: Array,
     link_colours: Mapping[str, tuple[float, float, float, float]],
+    T_gripper_camera: Array = _T_GRIPPER_CAMERA,
 ) -> RobotSpec:
     """A UR5e from airo-models' URDF with a gripper and a camera beside it.
 
@@ -41,6 +42,7 @@ def ur5e_with(
         gripper: what its flange carries; its base must be called `base_link`.
         T_gripper_tool: the tool frame `(4, 4)` in the gripper's base.
         link_colours: of the gripper's links.
+        T_gripper_camera: the wrist camera `(4, 4)` in the gripper's base.
     """
     base = "gripper_base_link"
     return RobotSpec(
@@ -63,7 +65,7 @@ def ur5e_with(
         gripper=gripper,
         gripper_base=base,
         T_gripper_tool=T_gripper_tool,
-        wrist_camera=CameraSpec("wrist", base, _T_GRIPPER_CAMERA, fov_y_deg=60.0),
+        wrist_camera=CameraSpec("wrist", base, T_gripper_camera, fov_y_deg=60.0),
         attachments=(
             Attachment(
                 "wrist_camera",
@@ -72,9 +74,9 @@ def ur5e_with(
                 # centre, and the arm that carries it from the gripper's body.
                 (
                     Shape("box", (0.09, 0.025, 0.025), pose([0, 0, -0.0175]), DARK),
-                    Shape("box", (0.02, 0.05, 0.01), pose([0, 0.03, -0.03]), DARK),
+                    Shape("box", (0.02, 0.05, 0.01), pose([0, -0.03, -0.03]), DARK),
                 ),
-                _T_GRIPPER_CAMERA,
+                T_gripper_camera,
                 mass=0.1,
             ),
         ),

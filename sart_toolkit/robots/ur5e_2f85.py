@@ -21,8 +21,9 @@ SPEC = ur5e_with(
         },
         closed_position=0.8,
         finger_links=("gripper_left_inner_finger_pad", "gripper_right_inner_finger_pad"),
-        # 50 N at each pad; the data sheet has 20 to 235 N.
+        # 50 N at each pad and 106 mm/s; the data sheet has 20 to 235 N, 20 to 150 mm/s.
         force=6.0,
+        speed=1.0,
         armature=1e-3,
     ),
     T_gripper_tool=pose([0, 0, 0.145]),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sart_toolkit.poses import pose
-from sart_toolkit.robots.spec import GripperSpec
+from sart_toolkit.robots.spec import GripperSpec, look_at
 from sart_toolkit.robots.ur5e import DARK, PAD, ur5e_with
+
+_STEEL = (0.60, 0.62, 0.65, 1.0)
 
 SPEC = ur5e_with(
     "ur5e_hande",
@@ -18,7 +22,19 @@ SPEC = ur5e_with(
         # The data sheet: 20 to 185 N, 20 to 150 mm/s between the jaws.
         force=60.0,
         speed=0.075,
+        armature=0.5,
     ),
     T_gripper_tool=pose([0, 0, 0.145]),
-    link_colours={"gripper_base_link": DARK, "gripper_left_jaw": PAD, "gripper_right_jaw": PAD},
+    link_colours={
+        "gripper_coupling": _STEEL,
+        "gripper_base_link": DARK,
+        "gripper_rail": _STEEL,
+        "gripper_left_jaw": PAD,
+        "gripper_right_jaw": PAD,
+    },
+    # Steeper than beside the 2F-85, 10 deg from the tool's axis: it looks past what hangs in the
+    # jaws at what is below.
+    T_gripper_camera=look_at(
+        np.array([0.0, 0.095, 0.02]), np.array([0.0, 0.0544, 0.25]), up=np.array([0.0, -1.0, 0.0])
+    ),
 )
