@@ -10,6 +10,11 @@ from sart_toolkit.tasks.task import Task
 
 TASKS = {
     "peg_in_hole": "sart_toolkit.tasks.peg_in_hole:PegInHole",
+    "door_opening": "sart_toolkit.tasks.door_opening:DoorOpening",
+    "lid_opening": "sart_toolkit.tasks.lid_opening:LidOpening",
+    "toolbox_picking": "sart_toolkit.tasks.toolbox_picking:ToolboxPicking",
+    "bottle_placing": "sart_toolkit.tasks.bottle_placing:BottlePlacing",
+    "lid_closing": "sart_toolkit.tasks.lid_closing:LidClosing",
 }
 
 

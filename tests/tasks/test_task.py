@@ -22,6 +22,7 @@ from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import SessionConfig, record_demonstration
+from sart_toolkit.teach.suggest import suggest_annotation
 
 
 @pytest.fixture(scope="module", params=TASKS)
@@ -178,6 +179,18 @@ def test_the_scripted_operator_succeeds_wherever_the_object_stands(task, model, 
         assert len(demonstration) < task.horizon * RECORD_HZ
         assert not demonstration.success[0]
         assert task.achieved(demonstration.success), (i, placement)
+
+
+def test_a_sphere_at_the_start_covers_every_placement(task, model):
+    backend = make_backend("pybullet", model.spec, task.scene, 16)
+    operator = ScriptedOperator(
+        task.plan(task.initial_state(model, Placement())), np.random.default_rng(0)
+    )
+    config = SessionConfig(cameras=(), keep_states=False)
+    demonstration = record_demonstration(backend, task, model, operator, config=config)
+    backend.close()
+    annotation = suggest_annotation(demonstration, model.spec, task.scene, [0])
+    assert annotation.spheres[0].radius >= np.hypot(*[task.placement_range] * 2)
 
 
 def test_the_object_stays_in_the_wrist_view_throughout_a_demonstration(task, model, backend):
