@@ -106,7 +106,7 @@ class LidOpening(Task):
     Goal: the lid lies open against its stop.
     Randomisation: the box is placed uniformly within ±10 cm in x and y of (0.63, 0) m; nothing else
     moves. The robot starts with the tool pitched 37 deg forward, the fingertips 25 cm above the lid
-    and 20 cm before the middle of the range.
+    and 18 cm before the middle of the range.
     Success: the hinge is open by more than 120 deg.
 
     The lid is 20 cm deep, 32 cm wide, 1 cm thick and weighs 0.5 kg; the notch in its front edge is
