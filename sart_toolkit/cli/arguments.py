@@ -260,6 +260,7 @@ class BenchmarkSkill:
     backends: _BACKENDS = "all"
     policy: _POLICY = "compact_mlp"
     n: _N = 40
+    epochs: Annotated[int | None, arg(help="Training epochs; the policy's own if left out.")] = None
     episodes: _EPISODES = 20
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000

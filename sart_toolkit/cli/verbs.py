@@ -389,8 +389,9 @@ def benchmark_skill_verb(args: BenchmarkSkill) -> Result:
         run = run_whole(
             Run(
                 cell.task.name, args.out / f"{cell.task.name}-{cell.backend}", cell.backend,
-                policy=args.policy, n=args.n, episodes=args.episodes, seed=args.seed,
-                eval_seed=args.eval_seed, workers=args.workers, device=args.device,
+                policy=args.policy, n=args.n, epochs=args.epochs, episodes=args.episodes,
+                seed=args.seed, eval_seed=args.eval_seed, workers=args.workers,
+                device=args.device,
             )
         )  # fmt: skip
         evaluation = read_json(args.out / f"{cell.task.name}-{cell.backend}" / "evaluation.json")

@@ -1,0 +1,143 @@
+"""A demonstration with a grasp: what is grasped counts as the robot's from then on."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from sart_toolkit.augment import engine
+from sart_toolkit.augment.engine import KEPT, AugmentConfig, try_segment
+from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.records import Annotation, PrecisionSphere, convergence_waypoint
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.storage import load_demonstration, save_demonstration
+from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks.task import Placement
+from sart_toolkit.teach.scripted import ScriptedOperator
+from sart_toolkit.teach.session import record_demonstration
+from sart_toolkit.teach.suggest import suggest_annotation
+
+
+@pytest.fixture(scope="module")
+def task():
+    return get_task("toolbox_picking")
+
+
+@pytest.fixture(scope="module")
+def model(task):
+    return RobotModel(get_robot(task.robot))
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def backend(request, task):
+    backend = make_backend(request.param, get_robot(task.robot), task.scene, 16)
+    yield backend
+    backend.close()
+
+
+@pytest.fixture(scope="module")
+def shown(task, model, backend):
+    operator = ScriptedOperator(
+        task.plan(task.initial_state(model, Placement())), np.random.default_rng(0)
+    )
+    return record_demonstration(backend, task, model, operator, seed=0)
+
+
+@pytest.fixture(scope="module")
+def carried_at(task, model, shown):
+    fingers = model.spec.gripper.finger_links
+    return [task.scene.grasped(touching, fingers) for touching in shown.touching]
+
+
+@pytest.fixture(scope="module")
+def annotation(task, model, shown):
+    return suggest_annotation(shown, model.spec, task.scene)
+
+
+def sphere_at(shown, t, radius):
+    sphere = PrecisionSphere(t, shown.steps.measured_Ts_world_tool[t], radius)
+    return Annotation((sphere,), shown.content_hash())
+
+
+def test_a_demonstration_keeps_what_touched_and_so_when_it_was_grasped(shown, carried_at, tmp_path):
+    first = carried_at.index({"toolbox"})
+    assert 10 < first < len(shown) - 10
+    assert all(carried == {"toolbox"} for carried in carried_at[first + 1 :])
+    assert ("table", "toolbox") in shown.touching[1]
+    assert ("table", "toolbox") not in shown.touching[-1]
+    save_demonstration(tmp_path / "demo.h5", shown)
+    assert load_demonstration(tmp_path / "demo.h5").touching == shown.touching
+    other = dataclasses.replace(shown, touching=((),) * len(shown))
+    assert other.content_hash() != shown.content_hash()
+
+
+def test_every_sphere_rejoins_before_the_gripper_or_a_contact_changes(
+    task, shown, carried_at, annotation
+):
+    commands = shown.steps.commanded_gripper
+    for sphere in annotation.spheres:
+        t, t_star = sphere.waypoint, convergence_waypoint(shown, sphere)
+        assert len(set(np.round(commands[t : t_star + 1], 2))) == 1
+        assert len(set(carried_at[t : t_star + 1])) == 1
+        for s in range(t, t_star + 1):
+            assert not task.scene.outer_contacts(shown.touching[s], carried_at[s])
+
+
+def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, carried_at):
+    carrying = [bool(carried_at[sphere.waypoint]) for sphere in annotation.spheres]
+    assert not carrying[0] and carrying[-1]
+    assert carrying == sorted(carrying)
+    reasons = [sphere.limited_by for sphere in annotation.spheres]
+    assert any("gripper command at waypoint" in reason for reason in reasons)
+    assert any(reason == "toolbox / table" for reason in reasons)
+
+
+def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(
+    backend, model, shown, annotation, carried_at
+):
+    config = AugmentConfig(n=8)
+    i = len(annotation.spheres) - 1
+    attempt = try_segment(backend, model, shown, annotation, config, i, 0)
+    assert attempt.outcome == KEPT
+    lifted = backend.observe().Ts_world_body["toolbox"][2, 3]
+    assert lifted > 0.01
+
+
+def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
+    backend, model, shown, carried_at
+):
+    height = shown.body_Ts_world["toolbox"][:, 2, 3]
+    t = next(s for s in range(len(shown)) if carried_at[s] and height[s] > 0.012)
+    config = AugmentConfig(n=8)
+    outcomes = {
+        try_segment(backend, model, shown, sphere_at(shown, t, 0.04), config, 0, k).outcome
+        for k in range(12)
+    }
+    assert "contact table / toolbox" in outcomes
+
+
+def test_a_segment_on_which_the_object_slips_is_rejected(
+    backend, model, shown, annotation, monkeypatch
+):
+    monkeypatch.setattr(engine, "_SLIP", 0.0)
+    i = len(annotation.spheres) - 1
+    attempt = try_segment(backend, model, shown, annotation, AugmentConfig(n=8), i, 0)
+    assert attempt.outcome == "toolbox slipped in the grasp"
+    assert attempt.episode is None
+
+
+def test_a_segment_on_which_the_open_fingers_touch_the_object_is_rejected(
+    backend, model, shown, carried_at
+):
+    t = next(s for s in range(len(shown)) if shown.steps.commanded_gripper[s] > 0.5) - 2
+    config = AugmentConfig(n=8)
+    outcomes = [
+        try_segment(backend, model, shown, sphere_at(shown, t - 1, 0.003), config, 0, k)
+        for k in range(2)
+    ]
+    assert all(attempt.outcome == KEPT for attempt in outcomes)
+    wide = sphere_at(shown, t - 1, 0.06)
+    tries = functools.partial(try_segment, backend, model, shown, wide, config, 0)
+    assert any("contact" in tries(k).outcome for k in range(8))
