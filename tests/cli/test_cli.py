@@ -10,10 +10,12 @@ from typing import Any
 
 import pytest
 
+from sart_toolkit.backends import BACKENDS
 from sart_toolkit.cli import main
 from sart_toolkit.doctor import Finding
 from sart_toolkit.evaluate.report import write_report
 from sart_toolkit.storage import load_demonstration
+from sart_toolkit.tasks import TASKS
 
 
 def run(capsys: pytest.CaptureFixture[str], *argv: object) -> dict[str, Any]:
@@ -267,6 +269,10 @@ def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str])
             main([verb, "--help"])
         assert exit_.value.code == 0
         assert f"Example: sart {verb}" in capsys.readouterr().out
+    for kind in ("operator", "replay", "skill"):
+        with pytest.raises(SystemExit):
+            main(["benchmark", kind, "--help"])
+        assert f"Example: sart benchmark {kind}" in capsys.readouterr().out
 
 
 def test_placement_can_be_random(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -276,6 +282,63 @@ def test_placement_can_be_random(tmp_path: Path, capsys: pytest.CaptureFixture[s
     placement = load_demonstration(out).task_parameters["placement"]
     assert said["placement"] == placement
     assert placement["x"] != 0.0 and abs(placement["x"]) <= 0.05
+
+
+def test_yaw_and_looks_vary_only_where_asked_for(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["record", "peg_in_hole", "--image-size", 32, "--out"]
+    assert "add --placement random" in error(capsys, *argv, tmp_path / "a.h5", "--yaw-deg", 5)
+    turn = ("--placement", "random", "--yaw-deg", 15)
+    assert run(capsys, *argv, tmp_path / "b.h5", *turn)["placement"]["yaw_deg"] != 0.0
+    assert "can be turned by 0 to" in error(
+        capsys, *argv, tmp_path / "c.h5", "--placement", "random", "--yaw-deg", 90
+    )
+    run(capsys, *argv, tmp_path / "d.h5", "--vary-looks")
+    plain, varied = (load_demonstration(p) for p in (chain / "demo.h5", tmp_path / "d.h5"))
+    assert (plain.raw_commands == varied.raw_commands).all()
+    pictures = [d.steps.cameras["wrist"].rgb[0].astype(int) for d in (plain, varied)]
+    assert abs(pictures[0] - pictures[1]).mean() > 2
+
+
+def test_the_operator_benchmark_prints_a_rate_for_each_task_and_backend(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "operator.json"
+    argv = ["benchmark", "operator", "--backends", "pybullet", "--episodes", 1, "--workers", 1]
+    argv += ["--tasks", "peg_in_hole,lid_closing"]
+    said = run(capsys, *argv, "--out", out)
+    assert set(said) == {"benchmark", "peg_in_hole/pybullet", "lid_closing/pybullet"}
+    assert said["lid_closing/pybullet"].startswith("1/1 (95 % interval 21 to 100 %)")
+    assert "already exists" in error(capsys, *argv, "--out", out)
+    assert "did you mean 'lid_closing'" in error(capsys, *argv[:-1], "lid_closin", "--out", out)
+    assert "unknown backend 'bullet'" in error(capsys, *argv[:2], "--backends", "bullet")
+
+
+def test_the_replay_benchmark_compares_backends(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "replay.json"
+    said = run(capsys, "benchmark", "replay", "--tasks", "bottle_placing", "--out", out)
+    assert "success, 0.0" in said["bottle_placing: pybullet to sapien"]
+    assert "success, 0.0" in said["bottle_placing: sapien to pybullet"]
+    assert len(json.loads(out.read_text())["replays"]) == 2
+
+
+@pytest.mark.slow
+def test_every_task_runs_from_demonstration_to_report_on_every_backend(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["benchmark", "skill", "--out", tmp_path / "runs", "--n", 4, "--epochs", 1]
+    argv += ["--episodes", 1, "--workers", 1]
+    said = run(capsys, *argv)
+    assert len(said) == 1 + len(TASKS) * len(BACKENDS)
+    for task in TASKS:
+        for backend in BACKENDS:
+            assert (tmp_path / "runs" / f"{task}-{backend}" / "report.html").exists()
+            assert "/1 (95 % interval" in said[f"{task}/{backend}"]
+    cells = json.loads((tmp_path / "runs" / "benchmark.json").read_text())["cells"]
+    assert {cell["kept"] for cell in cells.values()} == {3}
 
 
 def test_a_library_that_does_not_load_leads_to_the_doctor_who_needs_none(
