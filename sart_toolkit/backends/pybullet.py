@@ -108,6 +108,8 @@ class PyBulletBackend(Backend):
         self._scene_digest = scene_digest(self._model, scene)
         n = len(robot.arm_joints)
         self._target = self._last_target = np.zeros(n + 1)
+        # The bytes restored last, until something changes: Bullet numbers contacts anew each time.
+        self._restored: bytes | None = None
 
     def _load_bodies(self, root: Body) -> None:
         """Load a body and those that move on it as one multibody."""
@@ -189,6 +191,7 @@ class PyBulletBackend(Backend):
         q = self._model.check_limits(state.q)
         self.scene.check_state(state)
         c = self._client
+        self._forget_contacts()
         for joint, angle in zip(self._arm, q, strict=True):
             c.resetJointState(self._robot, joint, angle)
         for name, position in self.robot.gripper.joint_positions(state.gripper).items():
@@ -205,7 +208,16 @@ class PyBulletBackend(Backend):
         self._touched = {}
         # A restore from the file that this state saves to also drops what the solver remembers of
         # earlier contacts, so that what follows depends on the state alone.
+        self._restored = None
         self.restore(self.save())
+
+    def _forget_contacts(self) -> None:
+        """Take all bodies apart: contacts that last keep the forces that they had."""
+        c = self._client
+        for i, (index, link) in enumerate(self._bodies.values()):
+            if link < 0:
+                c.resetBasePositionAndOrientation(index, [100.0 + 10.0 * i, 0, 0], [0, 0, 0, 1])
+        c.performCollisionDetection()
 
     def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
         c = self._client
@@ -269,6 +281,7 @@ class PyBulletBackend(Backend):
         return CameraView(np.ascontiguousarray(rgb), depth.astype(np.float32), T_world_camera)
 
     def command(self, q: Array, gripper: float) -> None:
+        self._restored = None
         self._target = np.append(self._model.check_limits(q), check_gripper(gripper))
 
     def step(self) -> None:
@@ -277,6 +290,7 @@ class PyBulletBackend(Backend):
         ones = [1.0] * n
         gripper = self.robot.gripper
         self._touched = {}
+        self._restored = None
         for i in range(1, _STEPS + 1):
             target = self._last_target + (i / _STEPS) * (self._target - self._last_target)
             # Position gain 1 closes the whole error within one physics step. A velocity target
@@ -317,6 +331,8 @@ class PyBulletBackend(Backend):
         return [Contact(a, b, *values) for (a, b), values in sorted(self._touched.items())]
 
     def save(self) -> bytes:
+        if self._restored is not None:
+            return self._restored
         handle, path = tempfile.mkstemp(suffix=".bullet")
         os.close(handle)
         try:
@@ -353,6 +369,7 @@ class PyBulletBackend(Backend):
         self._last_target = np.array(head["last_target"])
         self._time = head["time"]
         self._touched = {}
+        self._restored = state
 
     def close(self) -> None:
         if self._client is not None:

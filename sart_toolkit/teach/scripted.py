@@ -34,7 +34,7 @@ class OperatorStyle:
     tremor_time: float = 0.25
     hesitation: float = 0.4
     turn_deg: float = 25.0
-    rest: float = 1.2
+    rest: float = 0.7
 
     def __post_init__(self) -> None:
         for name in ("reaction", "approach", "creep", "tremor_time", "turn_deg"):

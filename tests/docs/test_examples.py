@@ -26,6 +26,10 @@ def test_first_skill_on_a_small_budget_and_running_it(tmp_path: Path) -> None:
     assert "succeeded" in said or "failed: " in said
 
 
+def test_a_backend_of_one_s_own_moves_the_tool() -> None:
+    assert "the tool is at" in run("03_own_backend.py")
+
+
 def test_examples_are_short() -> None:
     for path in EXAMPLES.glob("*.py"):
         assert len(path.read_text().splitlines()) < 80, path.name

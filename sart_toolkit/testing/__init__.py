@@ -1,0 +1,10 @@
+"""What every backend promises, as a test suite for yours, in this repository or outside it.
+
+    pytest --pyargs sart_toolkit.testing --sart-backend my_package.my_module:MyBackend
+
+runs it with every robot of `ROBOTS`, or with those named by `--sart-robot`. Without options it
+tests our own `BACKENDS`. What a backend declares that it can't do is skipped. `-rs` tells why a
+test was skipped: "not judged before test_… passes" means that that one has to be mended first.
+
+Needs pytest: `pip install 'sart_toolkit[testing]'`.
+"""

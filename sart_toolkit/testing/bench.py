@@ -1,0 +1,329 @@
+"""A backend in one of the suite's scenes, and the ways in which the tests drive it."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from sart_toolkit.backends import BACKENDS
+from sart_toolkit.backends.interface import Backend, Contact, Observation
+from sart_toolkit.errors import InvalidInput, MissingCapability, MissingExtra
+from sart_toolkit.poses import Array, interpolate, inverse, pose
+from sart_toolkit.records import CONTROL_HZ
+from sart_toolkit.robots import ROBOTS
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.scene.spec import SceneSpec, SceneState
+from sart_toolkit.tables import lookup
+from sart_toolkit.testing.scenes import BLOCK_TOP, SCENES, STICK_TIP, ready_joints, site
+
+try:
+    import pytest
+except ImportError as error:
+    raise MissingExtra("pytest is missing; pip install 'sart_toolkit[testing]'") from error
+
+GRIPPER = 0.5
+
+# A convex part of a finger: its link, shape, pose in the link, and which side of the tool it is on.
+_Part = tuple[str, coal.CollisionGeometry, Array, int]
+
+
+def find_backend(name: str) -> type[Backend]:
+    """The class that a name of `BACKENDS` or `module:Class` names.
+
+    Raises:
+        InvalidInput: it isn't a `Backend`, or there is no such module or attribute.
+        UnknownName: no such name in the table.
+    """
+    found = _find("backend", name, BACKENDS)
+    if not (isinstance(found, type) and issubclass(found, Backend)):
+        raise InvalidInput(f"backend {name!r}: expected a subclass of Backend, got {found!r}")
+    return found
+
+
+def find_robot(name: str) -> RobotSpec:
+    """The robot that a name of `ROBOTS` or `module:SPEC` names.
+
+    Raises:
+        InvalidInput: it isn't a `RobotSpec`, or there is no such module or attribute.
+        UnknownName: no such name in the table.
+    """
+    found = _find("robot", name, ROBOTS)
+    if not isinstance(found, RobotSpec):
+        raise InvalidInput(f"robot {name!r}: expected a RobotSpec, got {found!r}")
+    return found
+
+
+def _find(kind: str, name: str, table: dict[str, str]) -> Any:
+    if ":" not in name:
+        return lookup(kind, name, table)
+    try:
+        return lookup(kind, name, {name: name})
+    except (ModuleNotFoundError, AttributeError, ValueError) as error:
+        raise InvalidInput(f"{kind} {name!r}: {error}; give it as module:name") from error
+
+
+@dataclass
+class Bench:
+    """A backend in a scene, and the robot's kinematics.
+
+    Attributes:
+        site: the frame `(4, 4)` under the tool that scenes are laid out in.
+        ready: the joints `(n,)` with the tool pointing down above it.
+        q, gripper: what was commanded last.
+    """
+
+    backend_name: str
+    robot_name: str
+    scene_name: str
+    backend: Backend
+    scene: SceneSpec
+    model: RobotModel
+    site: Array
+    ready: Array
+    q: Array
+    gripper: float = GRIPPER
+    _found: dict[str, bool] = field(default_factory=dict)
+
+    # --- what a test needs ----------------------------------------------------------------------
+
+    def needs(self, *capabilities: str) -> None:
+        """Skip the test where the backend lacks a capability."""
+        for capability in capabilities:
+            if not getattr(self.backend.capabilities, capability):
+                pytest.skip(f"backend {self.backend.name!r} declares {capability}=False")
+            self.relies_on(self.has(capability), "test_what_a_backend_declares_it_can_do_it_can")
+
+    def has(self, capability: str) -> bool:
+        """Whether the backend declares a capability and does have it."""
+        if capability not in self._found:
+            self._found[capability] = getattr(self.backend.capabilities, capability) and self.does(
+                capability
+            )
+        return self._found[capability]
+
+    def does(self, capability: str) -> bool:
+        """Whether the backend does what a capability says, whatever it declares."""
+        try:
+            if capability == "can_restore":
+                self.backend.restore(self.backend.save())
+            elif capability == "has_contacts":
+                self.backend.contacts()
+            elif capability == "renders":
+                self.backend.observe((self.backend.robot.wrist_camera.name,), 8)
+            else:
+                return bool(self.backend.observe().Ts_world_body)
+        except MissingCapability:
+            return False
+        return True
+
+    def relies_on(self, holds: object, test: str) -> None:
+        """Skip the test where it can't tell anything before another one passes."""
+        if not holds:
+            pytest.skip(f"not judged before {test} passes")
+
+    def relies_on_repeating(self) -> None:
+        """Skip the test where not even the same commands after the same reset do the same."""
+        if "repeats" not in self._found:
+            self.reset()
+            first = self.continuation()
+            self.reset()
+            self._found["repeats"] = self.continuation() == first
+            self.reset()
+        test = "test_the_same_commands_give_the_same_trajectory"
+        if self.scene_name == "loose":
+            test = "test_what_happens_to_free_bodies_after_a_reset_depends_on_the_state_alone"
+        self.relies_on(self._found["repeats"], test)
+
+    def relies_on_contacts(self) -> None:
+        """Skip the test where not even the stick on the block is reported; then reset."""
+        if "touch" not in self._found:
+            self.reset()
+            steps = self.lower_stick(-0.002)
+            self._found["touch"] = any(contacts for contacts in steps)
+            self.reset()
+        self.relies_on(self._found["touch"], "test_contact_is_reported_when_bodies_touch")
+
+    # --- driving --------------------------------------------------------------------------------
+
+    def state(self, q: Array | None = None, gripper: float = GRIPPER, **kwargs: Any) -> SceneState:
+        """The scene's state with the robot ready, or at `q`; the rest as for `initial_state`."""
+        return self.scene.initial_state(self.ready if q is None else q, gripper, **kwargs)
+
+    def reset(self, q: Array | None = None, gripper: float = GRIPPER, **kwargs: Any) -> SceneState:
+        """Reset to `state` of the same arguments, which is returned."""
+        state = self.state(q, gripper, **kwargs)
+        self.backend.reset(state)
+        self.q, self.gripper = np.array(state.q), state.commanded_gripper
+        return state
+
+    def command(self, q: Array, gripper: float | None = None, periods: int = 1) -> None:
+        """Command joints and gripper, and step."""
+        self.q = np.array(q)
+        self.gripper = self.gripper if gripper is None else gripper
+        for _ in range(periods):
+            self.backend.command(self.q, self.gripper)
+            self.backend.step()
+
+    def wait(self, seconds: float) -> None:
+        """Step without new commands."""
+        for _ in range(round(seconds * CONTROL_HZ)):
+            self.backend.step()
+
+    def see(self, cameras: Sequence[str] = (), size: int | None = None) -> Observation:
+        """What the backend observes."""
+        return self.backend.observe(cameras, size)
+
+    def joints_at(self, p: Sequence[float], q_near: Array | None = None) -> Array:
+        """The joints with the tool pointing down at `p (3,)` [m] of the site's frame."""
+        T = self.site @ pose(p, [np.pi, 0, 0])
+        return self.model.ik(T, self.ready if q_near is None else q_near)
+
+    def move_tool(self, p: Sequence[float], periods: int = 20) -> list[list[Contact]]:
+        """Move the tool straight to `p (3,)` [m] of the site's frame; the contacts of each step."""
+        start = self.model.fk(self.q)
+        goal = self.site @ pose(p, [np.pi, 0, 0])
+        found = []
+        for i in range(periods):
+            self.command(self.model.ik(interpolate(start, goal, (i + 1) / periods), self.q))
+            found.append(self.backend.contacts() if self.has("has_contacts") else [])
+        return found
+
+    def lower_stick(self, gap: float) -> list[list[Contact]]:
+        """Bring the stick's tip to `gap` [m] above the block; the contacts of each step."""
+        return self.move_tool([0, 0, BLOCK_TOP + STICK_TIP + gap])
+
+    def positions(self) -> dict[str, float]:
+        """The observed joint positions [rad or m] of all jointed bodies."""
+        Ts = self.see().Ts_world_body
+        return {name: self.scene.joint_position(name, Ts) for name in self.scene.jointed}
+
+    # --- what is compared -----------------------------------------------------------------------
+
+    def digest(self, pictures: bool = False) -> str:
+        """What is observed now but the time, to the bit; the wrist camera's picture if told."""
+        wrist = self.backend.robot.wrist_camera.name
+        return _digest(self.see((wrist,) if pictures and self.has("renders") else (), 32))
+
+    def continuation(self, periods: int = 6) -> list[str]:
+        """What is observed and touched, to the bit, while all joints move a little."""
+        seen = []
+        q = self.see().q
+        for i in range(1, periods + 1):
+            self.command(q + 0.004 * i * np.cos(np.arange(len(q))), GRIPPER + 0.01 * i)
+            touched = self.backend.contacts() if self.has("has_contacts") else []
+            seen.append(f"{self.digest(pictures=i == periods)} {touched}")
+        return seen
+
+    def finger_opening(self) -> float:
+        """The distance [m] between the facing fingers, by their shapes, as they are observed."""
+        Ts = self.see().Ts_world_body
+        links = self.model.spec.gripper.finger_links
+        Ts_link = {link: Ts[f"speck{i}"] for i, link in enumerate(links)}
+        return _opening(_finger_parts(self.robot_name), Ts_link)
+
+    def expected_opening(self, gripper: float) -> float:
+        """The distance [m] between the facing fingers by the robot's kinematics at a command."""
+        model = RobotModel(self.model.spec, self.scene.held, gripper)
+        links = self.model.spec.gripper.finger_links
+        Ts_link = {link: model.fk(self.ready, link) for link in links}
+        return _opening(_finger_parts(self.robot_name), Ts_link)
+
+
+def _digest(seen: Observation) -> str:
+    parts = [seen.q, seen.dq, np.array(seen.gripper), seen.T_world_tool]
+    parts += [T for _, T in sorted(seen.Ts_world_body.items())]
+    for _, view in sorted(seen.cameras.items()):
+        parts += [view.rgb, view.depth, view.T_world_camera]
+    sha = hashlib.sha256()
+    for part in parts:
+        sha.update(np.ascontiguousarray(part).tobytes())
+    return sha.hexdigest()
+
+
+def _opening(shapes: Sequence[_Part], Ts_world_link: dict[str, Array]) -> float:
+    """The least distance [m] between parts of fingers on either side of the tool."""
+    sides: tuple[list[Any], list[Any]] = ([], [])
+    for link, geometry, T_link_part, side in shapes:
+        T = Ts_world_link[link] @ T_link_part
+        sides[side].append((geometry, coal.Transform3s(T[:3, :3], T[:3, 3])))
+    return min(
+        float(coal.distance(*a, *b, coal.DistanceRequest(), coal.DistanceResult()))
+        for a in sides[0]
+        for b in sides[1]
+    )
+
+
+@functools.cache
+def _finger_parts(robot_name: str) -> list[_Part]:
+    """The convex parts of a robot's finger links."""
+    robot = find_robot(robot_name)
+    model = RobotModel(robot)
+    pinocchio_model = model.pinocchio_model
+    loaded = pin.buildGeomFromUrdf(
+        pinocchio_model,
+        str(model.urdf),
+        pin.GeometryType.COLLISION,
+        package_dirs=str(model.urdf.parent),
+    )
+    T_tool_world = inverse(model.fk(robot.home))
+    parts = []
+    for item in loaded.geometryObjects:
+        frame = pinocchio_model.frames[item.parentFrame]
+        if frame.name not in robot.gripper.finger_links:
+            continue
+        geometry = item.geometry
+        if isinstance(geometry, coal.BVHModelBase):
+            geometry.buildConvexHull(True, "Qt")
+            geometry = geometry.convex
+        T_joint_link = np.array(frame.placement.homogeneous)
+        T_link_part = inverse(T_joint_link) @ np.array(item.placement.homogeneous)
+        T_tool_part = T_tool_world @ model.fk(robot.home, frame.name) @ T_link_part
+        parts.append((frame.name, geometry, T_link_part, int(T_tool_part[0, 3] > 0)))
+    return parts
+
+
+@functools.cache
+def _whereabouts(robot_name: str) -> tuple[Array, Array]:
+    robot = find_robot(robot_name)
+    return site(robot), ready_joints(robot)
+
+
+def make_bench(
+    backend_name: str, robot_name: str, scene_name: str = "plain", scene: SceneSpec | None = None
+) -> Bench:
+    """A backend of either kind of name, with a robot, in one of `SCENES`, reset.
+
+    Args:
+        backend_name: one of `BACKENDS` or `module:Class`.
+        robot_name: one of `ROBOTS` or `module:SPEC`.
+        scene_name: one of `SCENES`.
+        scene: in place of that scene.
+    """
+    robot = find_robot(robot_name)
+    scene = scene or SCENES[scene_name](robot)
+    backend = find_backend(backend_name)(robot, scene, 64)
+    model = RobotModel(robot, scene.held)
+    here, ready = _whereabouts(robot_name)
+    bench = Bench(backend_name, robot_name, scene_name, backend, scene, model, here, ready, ready)
+    bench.reset()
+    return bench
+
+
+def continue_in_new_process(*words: str) -> None:
+    """Print as JSON the continuation of a saved state: backend, robot and file are named."""
+    backend_name, robot_name, path = words
+    bench = make_bench(backend_name, robot_name)
+    bench.backend.restore(Path(path).read_bytes())
+    sys.stdout.write("\n" + json.dumps(bench.continuation()))
+    bench.backend.close()

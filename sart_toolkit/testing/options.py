@@ -1,0 +1,57 @@
+"""The suite's command line options; pytest reads them here, before it has found the tests."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pytest
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add `--sart-backend` and `--sart-robot`."""
+    group = parser.getgroup("sart", "backends of sart_toolkit")
+    group.addoption(
+        "--sart-backend",
+        action="append",
+        metavar="NAME",
+        help="backend to test with `--pyargs sart_toolkit.testing`: one of BACKENDS or "
+        "module:Class; may be repeated (default: all BACKENDS)",
+    )
+    group.addoption(
+        "--sart-robot",
+        action="append",
+        metavar="NAME",
+        help="robot to test it with: one of ROBOTS or module:SPEC; may be repeated "
+        "(default: all ROBOTS)",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse names of backends and robots that name nothing.
+
+    Raises:
+        UsageError: one does.
+    """
+    backends = config.getoption("--sart-backend") or []
+    robots = config.getoption("--sart-robot") or []
+    if not backends and not robots:
+        return
+    # Not imported by every run of pytest where the toolkit is installed.
+    import pytest
+
+    from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
+    from sart_toolkit.testing.bench import find_backend, find_robot
+
+    if os.getcwd() not in sys.path:
+        # As with `python -m pytest`: a module in the working folder can be named.
+        sys.path.append(os.getcwd())
+    try:
+        for name in robots:
+            find_robot(name)
+        for name in backends:
+            find_backend(name)
+    except (InvalidInput, MissingExtra, UnknownName) as error:
+        raise pytest.UsageError(str(error)) from error

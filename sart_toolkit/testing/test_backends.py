@@ -1,0 +1,171 @@
+"""A backend's capabilities, its instances, and what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sart_toolkit.backends.interface import Capabilities
+from sart_toolkit.errors import InvalidInput, MissingCapability, UnknownName
+from sart_toolkit.poses import Array, pose
+from sart_toolkit.scene.spec import Body, SceneSpec, SceneState
+from sart_toolkit.testing.bench import Bench, find_backend
+
+Make = Callable[..., Bench]
+_ABILITIES = ("can_restore", "has_contacts", "renders", "observes_bodies")
+
+
+def test_capabilities_are_known_before_connecting(target: tuple[str, str]) -> None:
+    """They are an attribute of the class, and so is its name."""
+    backend = find_backend(target[0])
+    assert isinstance(backend.name, str)
+    assert isinstance(backend.capabilities, Capabilities)
+
+
+def test_the_declared_drift_is_small(bench: Bench) -> None:
+    """At most 1 mm and 0.2 deg: radii around a waypoint are not much larger."""
+    assert 0.0 <= bench.backend.capabilities.drift <= 1e-3
+    assert 0.0 <= bench.backend.capabilities.drift_deg <= 0.2
+
+
+@pytest.mark.parametrize("capability", _ABILITIES)
+def test_what_a_backend_declares_it_can_do_it_can(bench: Bench, capability: str) -> None:
+    """A declared capability that isn't there would be found out in the middle of a run."""
+    if getattr(bench.backend.capabilities, capability):
+        assert bench.does(capability)
+
+
+@pytest.mark.parametrize("capability", _ABILITIES)
+def test_what_a_backend_declares_it_cannot_do_raises(bench: Bench, capability: str) -> None:
+    """With MissingCapability: nothing is silently left out."""
+    if getattr(bench.backend.capabilities, capability):
+        return
+    if capability == "observes_bodies":
+        assert not bench.see().Ts_world_body
+        return
+    attempts: dict[str, list[Callable[[], object]]] = {
+        "can_restore": [bench.backend.save, lambda: bench.backend.restore(b"")],
+        "has_contacts": [bench.backend.contacts],
+        "renders": [lambda: bench.see((bench.backend.robot.wrist_camera.name,), 8)],
+    }
+    for attempt in attempts[capability]:
+        with pytest.raises(MissingCapability, match=r"can't \w+"):
+            attempt()
+
+
+# --- instances ----------------------------------------------------------------------------------
+
+
+def test_two_instances_do_the_same(bench: Bench, another: Make) -> None:
+    """Nothing depends on which was made first."""
+    bench.relies_on_repeating()
+    assert another().continuation() == bench.continuation()
+
+
+def test_two_instances_are_independent(bench: Bench, another: Make) -> None:
+    """What one is told and does, the other doesn't notice."""
+    bench.relies_on_repeating()
+    expected = bench.continuation()
+    bench.reset()
+    other = another()
+    seen = []
+    for i in range(1, 7):
+        offset = 0.004 * i * np.cos(np.arange(len(bench.ready)))
+        bench.backend.command(bench.ready + offset, bench.gripper + 0.01 * i)
+        other.backend.command(other.ready - 0.05, 0.1)
+        bench.backend.step()
+        touched = bench.backend.contacts() if bench.has("has_contacts") else []
+        other.backend.step()
+        seen.append(f"{bench.digest(pictures=i == 6)} {touched}")
+    assert seen == expected
+
+
+def test_closing_twice_does_nothing(bench: Bench) -> None:
+    """So that a `finally` may close what was closed."""
+    made = find_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16)
+    made.close()
+    made.close()
+
+
+def test_closing_one_instance_leaves_others_alone(bench: Bench) -> None:
+    """Neither the first close nor the second reaches somebody else's simulator."""
+    make = find_backend(bench.backend_name)
+    made, kept = (make(bench.backend.robot, bench.scene, 16) for _ in range(2))
+    kept.reset(bench.state())
+    made.close()
+    kept.step()
+    assert np.isfinite(kept.observe().T_world_tool).all()
+    kept.close()
+
+
+# --- refused ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("q", "gripper"),
+    [
+        pytest.param(lambda q: q[:-1], 0.5, id="a joint fewer"),
+        pytest.param(lambda q: np.append(q, 0.0), 0.5, id="a joint more"),
+        pytest.param(lambda q: q * np.nan, 0.5, id="no numbers"),
+        pytest.param(lambda q: q + 100.0, 0.5, id="above the limits"),
+        pytest.param(lambda q: q - 100.0, 0.5, id="below the limits"),
+        pytest.param(lambda q: q, -0.01, id="gripper below 0"),
+        pytest.param(lambda q: q, 1.01, id="gripper above 1"),
+        pytest.param(lambda q: q, np.nan, id="gripper no number"),
+    ],
+)
+def test_a_bad_command_is_refused_and_changes_nothing(
+    bench: Bench, q: Callable[[Array], Array], gripper: float
+) -> None:
+    """Not clipped to something else, and the last good command stays in force."""
+    bench.relies_on_repeating()
+    bench.backend.command(bench.ready + 0.01, 0.6)
+    bench.wait(0.1)
+    expected = bench.digest()
+    bench.reset()
+    bench.backend.command(bench.ready + 0.01, 0.6)
+    with pytest.raises(InvalidInput):
+        bench.backend.command(q(bench.ready), gripper)
+    bench.wait(0.1)
+    assert bench.digest() == expected
+
+
+def test_a_state_with_impossible_joints_is_refused(bench: Bench) -> None:
+    """Of the wrong number or outside their limits."""
+    for q in (bench.ready[:-1], bench.ready + 100.0):
+        with pytest.raises(InvalidInput):
+            bench.backend.reset(bench.state(q))
+
+
+def test_a_state_needs_exactly_the_bodies_of_the_scene(bench: Bench) -> None:
+    """Neither one more nor one fewer."""
+    table, block = bench.scene.bodies
+    more = SceneSpec((table, block, Body("cup", block.shapes)))
+    with pytest.raises(UnknownName, match="'cup'"):
+        bench.backend.reset(more.initial_state(bench.ready, 0.5))
+    fewer = SceneSpec((block,))
+    with pytest.raises(UnknownName, match="'table'"):
+        bench.backend.reset(fewer.initial_state(bench.ready, 0.5))
+
+
+def _off_its_joint(state: SceneState) -> dict[str, Any]:
+    T = state.Ts_world_body["drawer"] @ pose([0, 0.01, 0])
+    return {"Ts_world_body": {**state.Ts_world_body, "drawer": T}}
+
+
+def _beyond_its_limit(state: SceneState) -> dict[str, Any]:
+    return {"joint_positions": {**state.joint_positions, "drawer": 9.0}}
+
+
+@pytest.mark.parametrize("change", [_off_its_joint, _beyond_its_limit])
+def test_a_state_with_a_body_off_its_joint_is_refused(
+    jointed: Bench, change: Callable[[SceneState], dict[str, Any]]
+) -> None:
+    """A hinge has its body in one place only."""
+    state = jointed.state()
+    values = {"Ts_world_body": state.Ts_world_body, "joint_positions": state.joint_positions}
+    with pytest.raises(InvalidInput, match="'drawer'"):
+        jointed.backend.reset(SceneState(state.q, state.gripper, **{**values, **change(state)}))

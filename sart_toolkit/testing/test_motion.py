@@ -1,0 +1,98 @@
+"""Commanded joints, the tool's pose, time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sart_toolkit.records import CONTROL_HZ
+from sart_toolkit.testing.bench import Bench
+
+# Where a joint may be [rad] when it is where it was commanded to.
+_REACHED = 2e-3
+
+
+def test_commanded_joints_are_reached(bench: Bench) -> None:
+    """Each of them, both ways."""
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        offset = rng.uniform(0.1, 0.3, len(bench.ready)) * rng.choice([-1, 1], len(bench.ready))
+        bench.reset()
+        for s in np.linspace(0, 1, 20):
+            bench.command(bench.ready + s * offset)
+        bench.wait(0.3)
+        np.testing.assert_allclose(bench.see().q, bench.q, rtol=0, atol=_REACHED)
+
+
+def test_joints_follow_at_the_commanded_speed(bench: Bench) -> None:
+    """They are where they are told to be at the end of each control period, not some time later."""
+    speed = np.linspace(0.2, 0.8, len(bench.ready))
+    late = []
+    for i in range(1, 16):
+        bench.command(bench.ready + speed * i / CONTROL_HZ)
+        late.append(np.abs(bench.see().q - bench.q))
+    bench.wait(0.3)
+    arrived = np.abs(bench.see().q - bench.q) < _REACHED
+    bench.relies_on(arrived.any(), "test_commanded_joints_are_reached")
+    assert np.max(np.array(late)[:, arrived]) < 2 * _REACHED
+
+
+def test_joint_velocities_are_those_of_the_joints(bench: Bench) -> None:
+    """In rad/s, with the sign of the motion."""
+    speed = np.linspace(0.2, 0.8, len(bench.ready))
+    for i in range(1, 16):
+        before = bench.see().q
+        bench.command(bench.ready + speed * i / CONTROL_HZ)
+    seen = bench.see()
+    np.testing.assert_allclose(seen.dq, (seen.q - before) * CONTROL_HZ, rtol=0.02, atol=0.01)
+
+
+def test_joints_stay_within_their_limits(bench: Bench) -> None:
+    """A target at the limit is not overshot."""
+    for limit, sign in ((bench.model.upper[-1], -1), (bench.model.lower[-1], 1)):
+        q = bench.ready.copy()
+        q[-1] = limit + sign * 0.05
+        bench.reset(q)
+        for s in np.linspace(0, 1, 6):
+            q[-1] = limit + sign * 0.05 * (1 - s)
+            bench.command(q)
+            assert sign * (bench.see().q[-1] - limit) >= -1e-3
+
+
+def test_a_step_without_a_new_command_keeps_to_the_last_one(bench: Bench) -> None:
+    """A target stays in force until the next command."""
+    bench.command(bench.ready + 0.01, periods=10)
+    before = bench.see().q
+    bench.wait(0.5)
+    np.testing.assert_allclose(bench.see().q, before, rtol=0, atol=_REACHED)
+
+
+def test_the_tool_is_where_kinematics_have_it(bench: Bench) -> None:
+    """The tool frame's pose, not the flange's, in the frame of the robot's base."""
+    rng = np.random.default_rng(2)
+    for _ in range(4):
+        bench.reset(bench.ready + rng.uniform(-0.5, 0.5, len(bench.ready)))
+        bench.command(bench.q + 0.01)
+        seen = bench.see()
+        np.testing.assert_allclose(seen.T_world_tool, bench.model.fk(seen.q), rtol=0, atol=1e-4)
+
+
+def test_what_is_held_moves_rigidly_with_the_robot(bench: Bench) -> None:
+    """A scene's attachments stand where their frame has them."""
+    bench.needs("observes_bodies")
+    for offset in (0.0, 0.2):
+        bench.reset(bench.ready + offset)
+        bench.command(bench.q + 0.01)
+        seen = bench.see()
+        expected = bench.model.fk(seen.q, "stick")
+        np.testing.assert_allclose(seen.Ts_world_body["stick"], expected, rtol=0, atol=1e-4)
+
+
+def test_a_step_advances_time_by_one_control_period(bench: Bench) -> None:
+    """By 1/30 s, exactly."""
+    times = []
+    for _ in range(2 * CONTROL_HZ):
+        bench.command(bench.ready)
+        times.append(bench.see().time)
+    np.testing.assert_allclose(np.diff([0.0, *times]), 1 / CONTROL_HZ, rtol=0, atol=1e-12)
+    assert times[-1] == pytest.approx(2.0, abs=1e-12)

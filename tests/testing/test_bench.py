@@ -1,0 +1,98 @@
+"""What the suite tests is told on the command line; told wrongly, it says how."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from sart_toolkit.backends.pybullet import PyBulletBackend
+from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
+from sart_toolkit.robots import ROBOTS, get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.testing import bench as bench_module
+from sart_toolkit.testing import options, scenes
+from sart_toolkit.testing.bench import find_backend, find_robot, make_bench
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_backend_is_found_in_the_table_and_as_module_and_class():
+    assert find_backend("pybullet") is PyBulletBackend
+    assert find_backend("sart_toolkit.backends.pybullet:PyBulletBackend") is PyBulletBackend
+
+
+def test_a_robot_is_found_in_the_table_and_as_module_and_spec():
+    assert find_robot("ur5e_2f85") is find_robot("sart_toolkit.robots.ur5e_2f85:SPEC")
+
+
+@pytest.mark.parametrize("find", [find_backend, find_robot])
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("pybulet_2f85", UnknownName, "choose from"),
+        ("no_such_module:Thing", InvalidInput, "No module named 'no_such_module'.*module:name"),
+        ("sart_toolkit.poses:Thing", InvalidInput, "no attribute 'Thing'"),
+        ("sart_toolkit.poses:", InvalidInput, "module:name"),
+        ("sart_toolkit.poses:pose", InvalidInput, "expected a .*(Backend|RobotSpec)"),
+    ],
+)
+def test_a_name_that_names_nothing_is_refused(find, name, error, message):
+    with pytest.raises(error, match=message):
+        find(name)
+
+
+def test_a_wrong_name_on_the_command_line_is_a_usage_error(run_pytest, tmp_path):
+    result = run_pytest(tmp_path, "--sart-backend", "pybulet")
+    assert result.returncode == 4
+    assert "did you mean 'pybullet'" in result.stderr
+
+
+def test_a_module_in_the_working_folder_is_found(run_pytest, tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "from sart_toolkit.backends.pybullet import PyBulletBackend\n"
+        "class Mine(PyBulletBackend):\n    pass\n"
+    )
+    words = ["--sart-backend", "mine:Mine", "--sart-robot", "ur5e_hande", "-q", "-k", "drift_is"]
+    result = run_pytest(tmp_path, *words)
+    assert "1 passed" in result.stdout, result.stdout + result.stderr
+
+
+def test_by_default_all_our_backends_are_tested_with_all_robots(run_pytest, tmp_path):
+    result = run_pytest(tmp_path, "--collect-only", "-q", "-k", "drift_is")
+    found = [line for line in result.stdout.splitlines() if "::" in line]
+    targets = {line.partition("[")[2].rstrip("]") for line in found}
+    assert targets == {f"{b}-{r}" for b in ("pybullet", "sapien") for r in ROBOTS}
+
+
+def test_pytest_finds_the_options_by_the_module_s_own_name():
+    """So that `-p sart_toolkit.testing.options` does no harm."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["entry-points"]["pytest11"] == {options.__name__: options.__name__}
+
+
+def test_without_pytest_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pytest", None)
+    monkeypatch.delitem(sys.modules, bench_module.__name__)
+    with pytest.raises(MissingExtra, match=r"pip install 'sart_toolkit\[testing\]'"):
+        importlib.import_module(bench_module.__name__)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_scenes_are_laid_out_under_a_tool_that_points_down(name):
+    robot = get_robot(name)
+    T = RobotModel(robot).fk(scenes.ready_joints(robot))
+    assert T[2, 2] == pytest.approx(-1)
+    assert T[:2, 3] == pytest.approx(scenes.site(robot)[:2, 3])
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_fingers_of_a_closed_gripper_meet_and_those_of_an_open_one_do_not(name):
+    bench = make_bench("pybullet", name)
+    widths = {"ur5e_2f85": 0.085, "ur5e_hande": 0.05}
+    assert bench.expected_opening(0.0) == pytest.approx(widths[name], abs=0.002)
+    assert bench.expected_opening(1.0) == pytest.approx(0.0, abs=0.002)
+    bench.backend.close()
