@@ -7,16 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import pose
-from sart_toolkit.robots import get_robot
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.door_opening import BAR_GAP, BAR_RADIUS
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
 
 TASK = get_task("door_opening")
 PLACEMENT = Placement(0.03, -0.06, -10.0)
@@ -51,26 +46,6 @@ def test_a_shortfall_says_how_far_the_door_is_open():
     assert TASK.shortfall(_observation(30.2, np.eye(4))) == "door open by 30 of 45 deg"
 
 
-@pytest.fixture(scope="module")
-def model():
-    return RobotModel(get_robot(TASK.robot))
-
-
-@pytest.fixture(scope="module", params=BACKENDS)
-def backend(request, model):
-    backend = make_backend(request.param, model.spec, TASK.scene, 64)
-    yield backend
-    backend.close()
-
-
-def _demonstrate(backend, model, change=lambda stages: stages, placement=PLACEMENT):
-    stages = change(TASK.plan(TASK.initial_state(model, placement)))
-    operator = ScriptedOperator(stages, np.random.default_rng(5))
-    return record_demonstration(
-        backend, TASK, model, operator, placement, config=SessionConfig(keep_states=False)
-    )
-
-
 def _opened_deg(demonstration):
     """How far the door is open at each step `(T,)` [deg]."""
     Ts = demonstration.body_Ts_world
@@ -96,8 +71,8 @@ def test_the_handle_is_seen_at_the_start(backend, model, x, y):
     assert _handle_pixels(backend.observe(("wrist",)).cameras["wrist"].rgb) >= 15
 
 
-def test_the_fingers_pull_gently_at_nothing_but_the_door_and_see_the_handle(backend, model):
-    demonstration = _demonstrate(backend, model)
+def test_the_fingers_pull_gently_at_nothing_but_the_door_and_see_the_handle(demonstrate):
+    demonstration = demonstrate(cameras=("wrist",))
     assert TASK.achieved(demonstration.success)
     pairs = {pair for step in demonstration.touching for pair in step}
     assert pairs and pairs <= {("door", finger) for finger in FINGERS}
@@ -106,42 +81,40 @@ def test_the_fingers_pull_gently_at_nothing_but_the_door_and_see_the_handle(back
     assert _handle_pixels(demonstration.steps.cameras["wrist"].rgb).min() >= 15
 
 
-def test_a_door_that_is_let_go_falls_shut(backend, model):
+def test_a_door_that_is_let_go_falls_shut(demonstrate):
     def let_go(stages):
         back = replace(_shifted(stages, [0.02, -0.02, 0])[-1], tolerance=0.01)
         return [*stages, back, _shifted([back], [0, 0, 0.06])[0]]
 
-    demonstration = _demonstrate(backend, model, let_go)
+    demonstration = demonstrate(let_go)
     assert demonstration.success.any()
     assert _opened_deg(demonstration)[-1] < 1.0
     assert not TASK.achieved(demonstration.success)
 
 
-def test_pulling_over_the_handle_leaves_the_door_shut(backend, model):
-    demonstration = _demonstrate(backend, model, lambda stages: _shifted(stages, [0, 0, 0.03]))
+def test_pulling_over_the_handle_leaves_the_door_shut(demonstrate):
+    demonstration = demonstrate(lambda stages: _shifted(stages, [0, 0, 0.03]))
     assert not any(demonstration.touching)
     assert _opened_deg(demonstration).max() < 0.1
 
 
-def test_pulling_in_front_of_the_handle_leaves_the_door_shut(backend, model):
+def test_pulling_in_front_of_the_handle_leaves_the_door_shut(demonstrate):
     before = [-2 * BAR_RADIUS - BAR_GAP, 0, 0]
-    demonstration = _demonstrate(backend, model, lambda stages: _shifted(stages, before))
+    demonstration = demonstrate(lambda stages: _shifted(stages, before))
     assert _opened_deg(demonstration).max() < 0.1
 
 
-def test_pushing_against_the_panel_leaves_the_door_shut(backend, model):
+def test_pushing_against_the_panel_leaves_the_door_shut(demonstrate):
     def push(stages):
         beside = _shifted(stages[:2], [0, 0.1, 0])
         return [*beside, replace(_shifted(beside[-1:], [0.016, 0, 0])[0], tolerance=0.004)]
 
-    demonstration = _demonstrate(backend, model, push)
+    demonstration = demonstrate(push)
     assert any(demonstration.touching)
     assert _opened_deg(demonstration).max() < 0.5
 
 
-def test_a_door_pulled_half_open_is_no_success(backend, model):
-    demonstration = _demonstrate(
-        backend, model, lambda stages: [*stages[:4], replace(stages[4], through=False)]
-    )
+def test_a_door_pulled_half_open_is_no_success(demonstrate):
+    demonstration = demonstrate(lambda stages: [*stages[:4], replace(stages[4], through=False)])
     assert 20 < _opened_deg(demonstration)[-1] < 40
     assert not demonstration.success.any()

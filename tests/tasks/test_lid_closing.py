@@ -8,17 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import pose
-from sart_toolkit.robots import get_robot
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.lid_closing import LID_TOP, OPEN_DEG, TIP
 from sart_toolkit.tasks.parts import tool_down
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
 
 TASK = get_task("lid_closing")
 JAWS = ("gripper_left_jaw", "gripper_right_jaw")
@@ -74,25 +69,6 @@ def test_spring_and_catch_are_as_strong_as_the_card_says():
     assert HINGE.effort(np.deg2rad(OPEN_DEG)) == pytest.approx(0.04, abs=0.005)
 
 
-@pytest.fixture(scope="module")
-def model():
-    return RobotModel(get_robot(TASK.robot))
-
-
-@pytest.fixture(scope="module", params=BACKENDS)
-def backend(request, model):
-    backend = make_backend(request.param, model.spec, TASK.scene, 16)
-    yield backend
-    backend.close()
-
-
-def _demonstrate(backend, model, change=lambda stages: stages):
-    stages = change(TASK.plan(TASK.initial_state(model, PLACEMENT)))
-    operator = ScriptedOperator(stages, np.random.default_rng(3))
-    config = SessionConfig(cameras=(), keep_states=False)
-    return record_demonstration(backend, TASK, model, operator, PLACEMENT, config=config)
-
-
 def _moved(stages, *p_tool):
     return [replace(stage, T_world_tool=stage.T_world_tool @ pose(p_tool)) for stage in stages]
 
@@ -104,8 +80,8 @@ def _angles_deg(demonstration):
     return np.rad2deg(at)
 
 
-def test_the_lid_waits_open_and_stays_shut_and_nothing_else_is_touched(backend, model):
-    demonstration = _demonstrate(backend, model)
+def test_the_lid_waits_open_and_stays_shut_and_nothing_else_is_touched(demonstrate):
+    demonstration = demonstrate()
     assert TASK.achieved(demonstration.success)
     touched = {pair for step in demonstration.touching for pair in step}
     assert touched <= {(jaw, "lid") for jaw in JAWS}
@@ -134,8 +110,8 @@ def test_the_lid_waits_open_and_stays_shut_and_nothing_else_is_touched(backend, 
         pytest.param(lambda stages: stages[:2], False, id="not let go"),
     ],
 )
-def test_no_other_way_is_a_success(backend, model, change, opens):
-    demonstration = _demonstrate(backend, model, change)
+def test_no_other_way_is_a_success(demonstrate, backend, change, opens):
+    demonstration = demonstrate(change)
     assert not demonstration.success.any()
     text = f"lid {OPEN_DEG:.0f} deg open" if opens else "lid shut, but the jaws only .* mm above"
     assert re.match(text, TASK.shortfall(backend.observe()))

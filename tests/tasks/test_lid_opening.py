@@ -7,16 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import pose
-from sart_toolkit.robots import get_robot
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.lid_opening import BOX_HEIGHT, LID_THICKNESS, STOP_DEG
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
 
 TASK = get_task("lid_opening")
 PLACEMENT = Placement(-0.04, 0.07, 12.0)
@@ -49,26 +44,6 @@ def test_a_shortfall_says_how_far_the_lid_is_open():
     assert TASK.shortfall(_observation(89.7, np.eye(4))) == "lid open by 90 of 120 deg"
 
 
-@pytest.fixture(scope="module")
-def model():
-    return RobotModel(get_robot(TASK.robot))
-
-
-@pytest.fixture(scope="module", params=BACKENDS)
-def backend(request, model):
-    backend = make_backend(request.param, model.spec, TASK.scene, 64)
-    yield backend
-    backend.close()
-
-
-def _demonstrate(backend, model, change=lambda stages: stages):
-    stages = change(TASK.plan(TASK.initial_state(model, PLACEMENT)))
-    operator = ScriptedOperator(stages, np.random.default_rng(5))
-    return record_demonstration(
-        backend, TASK, model, operator, PLACEMENT, config=SessionConfig(keep_states=False)
-    )
-
-
 def _opened_deg(demonstration):
     """How far the lid is open at each step `(T,)` [deg]."""
     Ts = demonstration.body_Ts_world
@@ -94,8 +69,8 @@ def test_the_notch_is_seen_at_the_start(backend, model, x, y):
     assert _rim_pixels(backend.observe(("wrist",)).cameras["wrist"].rgb) >= 15
 
 
-def test_the_fingertips_lift_gently_touch_nothing_but_the_lid_and_see_the_notch(backend, model):
-    demonstration = _demonstrate(backend, model)
+def test_the_fingertips_lift_gently_touch_nothing_but_the_lid_and_see_the_notch(demonstrate):
+    demonstration = demonstrate(cameras=("wrist",))
     assert TASK.achieved(demonstration.success)
     pairs = {pair for step in demonstration.touching for pair in step}
     assert pairs and pairs <= {(pad, "lid") for pad in PADS}
@@ -108,25 +83,25 @@ def test_the_fingertips_lift_gently_touch_nothing_but_the_lid_and_see_the_notch(
 
 
 @pytest.mark.parametrize("legs", [5, 6])
-def test_a_lid_let_go_before_it_turns_over_falls_shut(backend, model, legs):
+def test_a_lid_let_go_before_it_turns_over_falls_shut(demonstrate, legs):
     def let_go(stages):
         last = replace(stages[legs - 1], through=False, tolerance=0.005)
         away = replace(last, T_world_tool=last.T_world_tool @ pose([0, 0, -0.08]))
         return [*stages[: legs - 1], last, away]
 
-    demonstration = _demonstrate(backend, model, let_go)
+    demonstration = demonstrate(let_go)
     assert 40 < _opened_deg(demonstration).max() < 80
     assert _opened_deg(demonstration)[-1] < 1.0
     assert not demonstration.success.any()
 
 
-def test_sweeping_over_the_lid_leaves_it_shut(backend, model):
-    demonstration = _demonstrate(backend, model, lambda stages: _raised(stages, 0.07))
+def test_sweeping_over_the_lid_leaves_it_shut(demonstrate):
+    demonstration = demonstrate(lambda stages: _raised(stages, 0.07))
     assert not any(demonstration.touching)
     assert _opened_deg(demonstration).max() < 0.1
 
 
-def test_pressing_on_the_lid_leaves_it_shut(backend, model):
+def test_pressing_on_the_lid_leaves_it_shut(demonstrate, model):
     def press(stages):
         T_world_box = TASK.initial_state(model, PLACEMENT).Ts_world_body["box"]
         T = stages[1].T_world_tool.copy()
@@ -135,6 +110,6 @@ def test_pressing_on_the_lid_leaves_it_shut(backend, model):
         on_lid = replace(stages[1], T_world_tool=T, tolerance=0.004)
         return [*_raised([on_lid], 0.05), *_raised([on_lid], -0.002)]
 
-    demonstration = _demonstrate(backend, model, press)
+    demonstration = demonstrate(press)
     assert any(demonstration.touching)
     assert _opened_deg(demonstration).max() < 0.5

@@ -8,17 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import inverse, pose
-from sart_toolkit.robots import get_robot
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.parts import tool_down
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.tasks.toolbox_picking import BAR_HEIGHT, MASS
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
 
 TASK = get_task("toolbox_picking")
 PADS = ("gripper_left_inner_finger_pad", "gripper_right_inner_finger_pad")
@@ -74,31 +69,12 @@ def test_a_shortfall_says_what_is_missing(observation, text):
     assert TASK.shortfall(observation) == text
 
 
-@pytest.fixture(scope="module")
-def model():
-    return RobotModel(get_robot(TASK.robot))
-
-
-@pytest.fixture(scope="module", params=BACKENDS)
-def backend(request, model):
-    backend = make_backend(request.param, model.spec, TASK.scene, 16)
-    yield backend
-    backend.close()
-
-
-def _demonstrate(backend, model, change=lambda stages: stages):
-    stages = change(TASK.plan(TASK.initial_state(model, PLACEMENT)))
-    operator = ScriptedOperator(stages, np.random.default_rng(3))
-    config = SessionConfig(cameras=(), keep_states=False)
-    return record_demonstration(backend, TASK, model, operator, PLACEMENT, config=config)
-
-
 def _moved(stages, *p_tool):
     return [replace(stage, T_world_tool=stage.T_world_tool @ pose(p_tool)) for stage in stages]
 
 
-def test_the_box_hangs_still_between_the_pads_and_nothing_else_is_touched(backend, model):
-    demonstration = _demonstrate(backend, model)
+def test_the_box_hangs_still_between_the_pads_and_nothing_else_is_touched(demonstrate):
+    demonstration = demonstrate()
     assert TASK.achieved(demonstration.success)
     pairs = {pair for step in demonstration.touching for pair in step}
     assert pairs == {("table", "toolbox"), *((pad, "toolbox") for pad in PADS)}
@@ -139,7 +115,7 @@ def test_the_box_hangs_still_between_the_pads_and_nothing_else_is_touched(backen
         ),
     ],
 )
-def test_no_other_way_is_a_success(backend, model, change, text):
-    demonstration = _demonstrate(backend, model, change)
+def test_no_other_way_is_a_success(demonstrate, backend, change, text):
+    demonstration = demonstrate(change)
     assert not demonstration.success.any()
     assert re.search(text, TASK.shortfall(backend.observe()))
