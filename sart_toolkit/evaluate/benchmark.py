@@ -132,9 +132,12 @@ def benchmark_operator(
     Raises:
         OutputExists: `out` is there and `overwrite` is false.
         Mismatch: it was interrupted with another seed or yaw.
+        InvalidInput: a task's objects can't be turned so far.
         CannotWrite: the disk refuses.
     """
     check_writable(out, overwrite)
+    for cell in cells:
+        cell.task.sample_placement(np.random.default_rng(config.seed), config.yaw_deg)
     log = out.with_suffix(".partial.jsonl")
     request = {"seed": config.seed, "yaw_deg": config.yaw_deg}
     if overwrite:
@@ -203,8 +206,13 @@ def benchmark_replay(
         cells: tasks on backends.
         seed: of placement and operator.
         progress: called with (done, wanted) after each replay.
+
+    Raises:
+        InvalidInput: no task has two backends.
     """
     pairs = [(a, b) for a, b in itertools.permutations(cells, 2) if a.task.name == b.task.name]
+    if not pairs:
+        raise InvalidInput("replay: needs two backends to compare, got one; name another")
     shown: dict[str, Demonstration] = {}
     rows = []
     for done, (source, target) in enumerate(pairs, 1):

@@ -111,6 +111,14 @@ def test_a_replay_on_another_backend_is_compared_with_what_was_recorded():
         assert np.abs([row["placement"]["x"], row["placement"]["y"]]).max() <= 0.05
 
 
+def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(InvalidInput, match="can be turned by 0 to"):
+        benchmark_operator([cell()], BenchmarkConfig(1, yaw_deg=90.0), tmp_path / "out.json")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InvalidInput, match="needs two backends"):
+        benchmark_replay([cell()])
+
+
 @pytest.mark.parametrize(("episodes", "seed"), [(0, 0), (1, -1)])
 def test_bad_numbers_are_refused(episodes, seed):
     with pytest.raises(InvalidInput, match="expected"):
