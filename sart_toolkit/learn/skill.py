@@ -34,6 +34,10 @@ from sart_toolkit.records import (
 )
 
 
+# A gripper that is told to open and to close knows two; more stand for a finger on a trigger.
+_FEW_GRIPPER_COMMANDS = 4
+
+
 @dataclass(frozen=True)
 class SkillConfig:
     """What must be known to execute a skill elsewhere.
@@ -117,6 +121,7 @@ class Skill:
         self.training = dict(training)
         self._device = resolve_device(device)
         self._policy = policy.to(self._device).eval()
+        self._gripper_commands = np.unique(demonstration.steps.commanded_gripper)
         self._pictures: deque[Image] = deque(maxlen=config.training.history)
         self._gripper: deque[float] = deque(maxlen=config.training.history)
 
@@ -127,6 +132,8 @@ class Skill:
 
     def act(self, rgb: Image, gripper: float) -> Array:
         """The action `(7,)`: xyz [m], rotation vector [rad], tool frame; gripper target in [0, 1].
+
+        Where the demonstration knew a few gripper commands only, the nearest of them is given.
 
         Args:
             rgb: what the skill's camera sees now, uint8 `(H, W, 3)` of any size; resized exactly
@@ -153,7 +160,20 @@ class Skill:
             action = self._policy(
                 frames.to(self._device), torch.tensor([list(self._gripper)], device=self._device)
             )
-        return action[0].double().cpu().numpy()
+        values = action[0].double().cpu().numpy()
+        values[6] = self._commandable(values[6])
+        return values
+
+    def _commandable(self, gripper: float) -> float:
+        """The gripper target itself, or the nearest of the few that the demonstration commanded.
+
+        A regressed target is a little off, the gripper follows it, and the policy follows the
+        gripper: what was shown only open or closed would creep shut on the way.
+        """
+        shown = self._gripper_commands
+        if len(shown) > _FEW_GRIPPER_COMMANDS:
+            return gripper
+        return float(shown[np.argmin(np.abs(shown - gripper))])
 
 
 def save_skill(

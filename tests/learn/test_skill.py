@@ -59,7 +59,27 @@ def test_a_skill_acts_as_the_policy_did_in_training(trained, dataset):
                 expected = result.policy(frames, gripper)[0].numpy()
             action = skill.act(steps.cameras["wrist"].rgb[t], float(steps.measured_gripper[t]))
             assert action.shape == (7,) and action.dtype == np.float64
-            assert np.allclose(action, expected, atol=1e-7)
+            assert np.allclose(action[:6], expected[:6], atol=1e-7)
+            # Shown only open or closed, so commanded so.
+            assert action[6] == round(float(expected[6]))
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_the_gripper_is_told_what_was_shown_unless_that_was_much(trained, dataset, few):
+    demonstration = dataset.demonstration
+    shown = np.linspace(0, 0.8, 3 if few else len(demonstration.steps))
+    commands = np.resize(shown, len(demonstration.steps))
+    steps = dataclasses.replace(demonstration.steps, commanded_gripper=commands)
+    skill = load_skill(trained[0])
+    other = dataclasses.replace(demonstration, steps=steps)
+    skill = Skill(skill._policy, skill.config, other, skill.annotation, skill.training)
+    told = {
+        skill.act(rgb, gripper)[6]
+        for rgb, gripper in zip(
+            demonstration.steps.cameras["wrist"].rgb, np.linspace(0, 1, len(steps)), strict=True
+        )
+    }
+    assert (told <= set(shown)) == few
 
 
 def test_a_skill_sees_pictures_and_gripper_and_nothing_else():
