@@ -33,7 +33,6 @@ from sart_toolkit.records import (
     library_versions,
 )
 
-
 # A gripper that is told to open and to close knows two; more stand for a finger on a trigger.
 _FEW_GRIPPER_COMMANDS = 4
 
