@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sart_toolkit.learn.training import TrainConfig, train
     from sart_toolkit.robots import get_robot
     from sart_toolkit.robots.model import RobotModel
+    from sart_toolkit.scene.appearance import vary_appearance
     from sart_toolkit.storage import (
         load_annotation,
         load_dataset,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     )
     from sart_toolkit.tasks import get_task
     from sart_toolkit.tasks.task import Placement
+    from sart_toolkit.teach.replay import replay_demonstration
     from sart_toolkit.teach.scripted import ScriptedOperator
     from sart_toolkit.teach.session import record_demonstration
     from sart_toolkit.teach.suggest import SuggestConfig, suggest_annotation
@@ -50,11 +52,13 @@ _HOMES = {
     "load_skill": "learn.skill",
     "make_backend": "backends",
     "record_demonstration": "teach.session",
+    "replay_demonstration": "teach.replay",
     "save_annotation": "storage",
     "save_demonstration": "storage",
     "save_skill": "learn.skill",
     "suggest_annotation": "teach.suggest",
     "train": "learn.training",
+    "vary_appearance": "scene.appearance",
     "write_report": "evaluate.report",
 }
 __all__ = [
@@ -76,11 +80,13 @@ __all__ = [
     "load_skill",
     "make_backend",
     "record_demonstration",
+    "replay_demonstration",
     "save_annotation",
     "save_demonstration",
     "save_skill",
     "suggest_annotation",
     "train",
+    "vary_appearance",
     "write_report",
 ]
 
