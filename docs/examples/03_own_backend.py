@@ -1,15 +1,15 @@
 """A backend of one's own: a robot that is wherever it was told to be, without a simulator.
 
-Run: python docs/examples/03_own_backend.py
 Test: pytest --pyargs sart_toolkit.testing --sart-backend 03_own_backend:KinematicBackend
 """
 
 import numpy as np
 
 import sart_toolkit as sart
-from sart_toolkit.backends.interface import Backend, Capabilities, Observation, check_gripper
+from sart_toolkit.backends.interface import Backend, Capabilities, Observation
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
 from sart_toolkit.records import CONTROL_HZ
+from sart_toolkit.robots.spec import check_gripper
 
 
 class KinematicBackend(Backend):

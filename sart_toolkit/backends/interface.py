@@ -72,17 +72,6 @@ class Contact:
     penetration: float
 
 
-def check_gripper(gripper: float) -> float:
-    """`gripper` if it is a command in [0, 1].
-
-    Raises:
-        InvalidInput: it is not.
-    """
-    if not 0.0 <= gripper <= 1.0:
-        raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {gripper}")
-    return float(gripper)
-
-
 def check_size(image_size: int) -> int:
     """`image_size` if it is a picture's width and height [pixels].
 

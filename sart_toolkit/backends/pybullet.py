@@ -19,7 +19,6 @@ from sart_toolkit.backends.interface import (
     Capabilities,
     Contact,
     Observation,
-    check_gripper,
     check_size,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
@@ -27,7 +26,7 @@ from sart_toolkit.errors import BrokenFile
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.robots.spec import RobotSpec, check_gripper
 from sart_toolkit.robots.urdf import add_joint, rigid_link
 from sart_toolkit.scene.spec import Body, Joint, SceneSpec, SceneState
 
@@ -92,6 +91,7 @@ class PyBulletBackend(Backend):
         # Where each body is: its multibody, and its link there (-1: the base).
         self._bodies: dict[str, tuple[int, int]] = {}
         self._springs: list[tuple[int, int, Joint]] = []
+        self._Ts_body_centre: dict[int, Array] = {}
         for body in scene.bodies:
             if body.joint is None:
                 self._load_bodies(body)
@@ -120,6 +120,9 @@ class PyBulletBackend(Backend):
                 path, useFixedBase=root.mass is None, flags=p.URDF_USE_INERTIA_FROM_FILE
             )
         self._bodies[root.name] = index, -1
+        # PyBullet's base is a body's centre of mass with its principal axes.
+        dynamics = c.getDynamicsInfo(index, -1)
+        self._Ts_body_centre[index] = _matrix(dynamics[3], dynamics[4])
         for link in range(c.getNumJoints(index)):
             body = moving[c.getJointInfo(index, link)[12].decode()]
             assert body.joint is not None
@@ -200,7 +203,7 @@ class PyBulletBackend(Backend):
             if link >= 0:
                 c.resetJointState(index, link, state.joint_positions[name])
                 continue
-            T = state.Ts_world_body[name] @ self._T_body_centre(index)
+            T = state.Ts_world_body[name] @ self._Ts_body_centre[index]
             c.resetBasePositionAndOrientation(index, T[:3, 3], _quaternion(T))
             c.resetBaseVelocity(index, [0, 0, 0], [0, 0, 0])
         self._target = self._last_target = np.append(q, state.commanded_gripper)
@@ -235,7 +238,7 @@ class PyBulletBackend(Backend):
                 Ts_body[name] = self._link_pose(index, link)
             else:
                 T_world_centre = _matrix(*c.getBasePositionAndOrientation(index))
-                Ts_body[name] = T_world_centre @ inverse(self._T_body_centre(index))
+                Ts_body[name] = T_world_centre @ inverse(self._Ts_body_centre[index])
         return Observation(
             q=np.array([s[0] for s in states]),
             dq=np.array([s[1] for s in states]),
@@ -249,11 +252,6 @@ class PyBulletBackend(Backend):
     def _link_pose(self, index: int, link: int) -> Array:
         state = self._client.getLinkState(index, link, 0, 1)
         return _matrix(state[4], state[5])
-
-    def _T_body_centre(self, index: int) -> Array:
-        """PyBullet's base is a body's centre of mass with its principal axes."""
-        dynamics = self._client.getDynamicsInfo(index, -1)
-        return _matrix(dynamics[3], dynamics[4])
 
     def _picture(self, name: str, Ts_world_frame: dict[str, Array], size: int) -> CameraView:
         camera = self.cameras[name]

@@ -19,14 +19,12 @@ from sart_toolkit.backends.interface import (
     Capabilities,
     Contact,
     Observation,
-    check_gripper,
     check_size,
 )
 from sart_toolkit.backends.sapien_pictures import (
     ALONG_Z,
     REMEDY,
     Pictures,
-    primitive,
     sapien,
     sapien_axis,
     sapien_pose,
@@ -37,7 +35,8 @@ from sart_toolkit.errors import InvalidInput, MissingCapability, SartError
 from sart_toolkit.poses import Array
 from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec, Shape, mass_properties
+from sart_toolkit.robots.spec import RobotSpec, Shape, check_gripper, mass_properties
+from sart_toolkit.scene.clearance import primitive
 from sart_toolkit.scene.spec import Body, Joint, SceneSpec, SceneState
 
 _STEPS = PHYSICS_HZ // CONTROL_HZ
@@ -295,7 +294,7 @@ class _RobotParts:
         for item in self.geometry(pin.GeometryType.COLLISION).geometryObjects:
             T = np.array(item.placement.homogeneous)
             mesh = item.meshPath.endswith(".obj")
-            shape = item.meshPath if mesh else primitive(item.geometry, T)
+            shape = item.meshPath if mesh else primitive(item.geometry)
             link = self.model.frames[item.parentFrame].name
             self.parts.setdefault(int(item.parentJoint), []).append((link, shape, T))
         rank = [0]

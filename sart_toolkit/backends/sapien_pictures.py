@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
@@ -12,21 +13,21 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import coal
 import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit.backends.interface import CameraView
-from sart_toolkit.errors import CannotWrite, InvalidInput, MissingCapability, MissingExtra
+from sart_toolkit.errors import CannotWrite, MissingCapability, MissingExtra
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.spec import CameraSpec, Shape
 from sart_toolkit.robots.urdf import cache_dir
+from sart_toolkit.scene.clearance import primitive
 from sart_toolkit.scene.spec import Light, SceneSpec
 
 try:
@@ -404,33 +405,9 @@ def _shape(shape: Shape) -> Any:
 def _robot_shape(item: pin.GeometryObject) -> Any:
     T, rgba = np.array(item.placement.homogeneous), item.meshColor.tolist()
     if not item.meshPath.endswith(".obj"):
-        return _shape(primitive(item.geometry, T, rgba))
+        shape = primitive(item.geometry)
+        return _shape(dataclasses.replace(shape, T_body_shape=T, rgba=tuple(rgba)))
     material = sapien.render.RenderMaterial(base_color=rgba)
     made = sapien.render.RenderShapeTriangleMesh(item.meshPath, material=material)
     made.local_pose = sapien_pose(T)
     return made
-
-
-def primitive(
-    geometry: coal.CollisionGeometry,
-    T: Array,
-    rgba: Sequence[float] = (0.7, 0.7, 0.7, 1.0),
-) -> Shape:
-    """A box, sphere or cylinder of a URDF at `T (4, 4)` as a shape.
-
-    Raises:
-        InvalidInput: it is none of these.
-    """
-    colour = float(rgba[0]), float(rgba[1]), float(rgba[2]), float(rgba[3])
-    if isinstance(geometry, coal.Box):
-        x, y, z = 2 * np.array(geometry.halfSide)
-        return Shape("box", (float(x), float(y), float(z)), T, colour)
-    if isinstance(geometry, coal.Sphere):
-        return Shape("sphere", (float(geometry.radius),), T, colour)
-    if isinstance(geometry, coal.Cylinder):
-        size = float(geometry.radius), 2 * float(geometry.halfLength)
-        return Shape("cylinder", size, T, colour)
-    raise InvalidInput(
-        f"geometry {type(geometry).__name__} isn't one that the sapien backend knows; use meshes, "
-        "boxes, spheres or cylinders in the URDF"
-    )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.backends.interface import BackendFactory
+from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.records import Demonstration, library_versions
@@ -85,12 +85,7 @@ class _Operator:
         started = time.perf_counter()
         row = {"cell": name, "episode": episode, "placement": placement.to_json()}
         try:
-            operator = ScriptedOperator(
-                cell.task.plan(cell.task.initial_state(model, placement)), rng
-            )
-            shown = record_demonstration(
-                backend, cell.task, model, operator, placement, config=_BLIND
-            )
+            shown = _shown(cell.task, backend, model, placement, rng)
             success = cell.task.achieved(shown.success)
             row |= {
                 "success": success,
@@ -155,13 +150,15 @@ def benchmark_operator(
     wanted = [(cell.name, i) for cell in cells for i in range(config.episodes)]
     missing = [item for item in wanted if item not in rows]
     done = len(wanted) - len(missing)
+    successes = sum(rows[item]["success"] for item in wanted if item in rows)
     with worker_map(functools.partial(_Operator, cells, config), workers) as run:
         for item, row in zip(missing, run(missing), strict=True):
             rows[item] = row
             append_json_line(log, row)
             done += 1
+            successes += row["success"]
             if progress is not None:
-                progress(done, len(wanted), sum(rows[i]["success"] for i in wanted if i in rows))
+                progress(done, len(wanted), successes)
     table = {
         cell.name: _summary([rows[cell.name, i] for i in range(config.episodes)]) for cell in cells
     }
@@ -220,7 +217,9 @@ def benchmark_replay(
         rng = np.random.default_rng([seed, 0])
         placement = task.sample_placement(rng)
         if source.name not in shown:
-            shown[source.name] = _shown(source, placement, rng)
+            with closing(source.make_backend()) as backend:
+                model = RobotModel(backend.robot, backend.scene.held)
+                shown[source.name] = _shown(task, backend, model, placement, rng)
         original = shown[source.name]
         with closing(target.make_backend()) as backend:
             model = RobotModel(backend.robot, backend.scene.held)
@@ -250,8 +249,9 @@ def benchmark_replay(
     return {"seed": seed, "replays": rows, "versions": library_versions()}
 
 
-def _shown(cell: Cell, placement: Placement, rng: np.random.Generator) -> Demonstration:
-    with closing(cell.make_backend()) as backend:
-        model = RobotModel(backend.robot, backend.scene.held)
-        operator = ScriptedOperator(cell.task.plan(cell.task.initial_state(model, placement)), rng)
-        return record_demonstration(backend, cell.task, model, operator, placement, config=_BLIND)
+def _shown(
+    task: Task, backend: Backend, model: RobotModel, placement: Placement, rng: np.random.Generator
+) -> Demonstration:
+    """The scripted operator's demonstration, without pictures."""
+    operator = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
+    return record_demonstration(backend, task, model, operator, placement, config=_BLIND)

@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable, unknown_name
 from sart_toolkit.poses import Array, check_array, check_pose, frozen
-from sart_toolkit.robots.spec import Attachment, RobotSpec
+from sart_toolkit.robots.spec import Attachment, RobotSpec, check_gripper
 from sart_toolkit.robots.urdf import composed_urdf
 
 _IK_STEPS = 60
@@ -44,11 +44,9 @@ class RobotModel:
             InvalidInput: gripper command out of range, or joints in another order.
             UnknownName: a joint or frame of `spec` or `held` isn't in the URDF.
         """
-        if not 0.0 <= gripper <= 1.0:
-            raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {gripper}")
         self.spec = spec
         self.held = tuple(held)
-        self.gripper = float(gripper)
+        self.gripper = check_gripper(gripper)
         self.urdf = composed_urdf(spec, held)
         full = pin.buildModelFromUrdf(str(self.urdf))
         linkage = spec.gripper.joint_positions(gripper)

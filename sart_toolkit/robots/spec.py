@@ -154,6 +154,17 @@ def look_at(p_camera: Array, p_target: Array, up: Array) -> Array:
     return T
 
 
+def check_gripper(gripper: float) -> float:
+    """`gripper` if it is a command in [0, 1].
+
+    Raises:
+        InvalidInput: it is not.
+    """
+    if not 0.0 <= gripper <= 1.0:
+        raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {gripper}")
+    return float(gripper)
+
+
 @dataclass(frozen=True)
 class GripperSpec:
     """A gripper: its URDF, its linkage, and what its one command means.

@@ -36,7 +36,7 @@ class ToolClearance:
 
 
 @dataclass(frozen=True)
-class _Part:
+class RobotPart:
     """One convex part of a link: its geometry and its pose in the joint that carries it."""
 
     link: str
@@ -61,7 +61,7 @@ class ClearanceModel:
         pinocchio_model = model.pinocchio_model
         self._data = pinocchio_model.createData()
         last = pinocchio_model.njoints - 1
-        parts = [part for part in _robot_parts(model) if part.joint > 0]
+        parts = [part for part in robot_parts(model) if part.joint > 0]
         self._tool = [part for part in parts if part.joint == last]
         self._arm = [part for part in parts if part.joint < last]
         # The last three joints of an arm share its wrist, whose links neighbour the tool.
@@ -89,7 +89,7 @@ class ClearanceModel:
             if name not in Ts_world_body:
                 raise unknown_name("body", name, Ts_world_body)
         return [
-            (name, geometry, _transform(Ts_world_body[name] @ shape.T_body_shape))
+            (name, geometry, coal_transform(Ts_world_body[name] @ shape.T_body_shape))
             for name, geometry, shape in self._shapes
             if name not in carried
         ]
@@ -122,9 +122,9 @@ class ClearanceModel:
                 bodies.append((name, geometry, T @ shape.T_body_shape, reach))
         clearances = []
         for link, geometry, T, reach in bodies:
-            placed = _transform(T)
+            placed = coal_transform(T)
             pairs = [
-                PairDistance(link, name, _distance(geometry, placed, other, T_other))
+                PairDistance(link, name, convex_distance(geometry, placed, other, T_other))
                 for name, other, T_other in scene
             ]
             nothing = PairDistance(link, "", np.inf)
@@ -145,18 +145,18 @@ class ClearanceModel:
         joints = self._joint_poses(q)
         scene = self._placed_scene(Ts_world_body, carried)
         placed = {
-            id(part): _transform(joints[part.joint] @ part.T_joint_part)
+            id(part): coal_transform(joints[part.joint] @ part.T_joint_part)
             for part in (*self._arm, *self._tool)
         }
         best = PairDistance("", "", np.inf)
         for part in self._arm:
             for name, geometry, T in scene:
-                distance = _distance(part.geometry, placed[id(part)], geometry, T)
+                distance = convex_distance(part.geometry, placed[id(part)], geometry, T)
                 if distance < best.distance:
                     best = PairDistance(part.link, name, distance)
         for part in self._tool:
             for other in self._arm_apart:
-                distance = _distance(
+                distance = convex_distance(
                     part.geometry, placed[id(part)], other.geometry, placed[id(other)]
                 )
                 if distance < best.distance:
@@ -164,7 +164,12 @@ class ClearanceModel:
         return best
 
 
-def _robot_parts(model: RobotModel) -> list[_Part]:
+def robot_parts(model: RobotModel) -> list[RobotPart]:
+    """The convex parts of a robot's links and of what it holds, as its URDF has them.
+
+    Raises:
+        InvalidInput: a part is neither a mesh nor a box, sphere or cylinder.
+    """
     pinocchio_model = model.pinocchio_model
     loaded = pin.buildGeomFromUrdf(
         pinocchio_model,
@@ -181,7 +186,7 @@ def _robot_parts(model: RobotModel) -> list[_Part]:
         frame = pinocchio_model.frames[item.parentFrame]
         T = np.array(item.placement.homogeneous)
         points = _points(geometry) @ T[:3, :3].T + T[:3, 3]
-        parts.append(_Part(frame.name, int(item.parentJoint), geometry, T, points))
+        parts.append(RobotPart(frame.name, int(item.parentJoint), geometry, T, points))
     return parts
 
 
@@ -189,16 +194,25 @@ def _points(geometry: coal.CollisionGeometry) -> Array:
     """Points `(n, 3)` whose convex hull encloses a convex geometry."""
     if isinstance(geometry, coal.ConvexBase):
         return np.array(geometry.points()).reshape(-1, 3)
+    return primitive(geometry).corners()
+
+
+def primitive(geometry: coal.CollisionGeometry) -> Shape:
+    """A box, sphere or cylinder of a URDF as a shape at its body's origin.
+
+    Raises:
+        InvalidInput: it is none of these.
+    """
     if isinstance(geometry, coal.Box):
-        x, y, z = 2 * np.array(geometry.halfSide)
-        return Shape("box", (x, y, z)).corners()
+        x, y, z = (2 * float(half) for half in geometry.halfSide)
+        return Shape("box", (x, y, z))
     if isinstance(geometry, coal.Sphere):
-        return Shape("sphere", (geometry.radius,)).corners()
+        return Shape("sphere", (float(geometry.radius),))
     if isinstance(geometry, coal.Cylinder):
-        return Shape("cylinder", (geometry.radius, 2 * geometry.halfLength)).corners()
+        return Shape("cylinder", (float(geometry.radius), 2 * float(geometry.halfLength)))
     raise InvalidInput(
-        f"collision geometry {type(geometry).__name__} is not convex; use meshes, boxes, spheres "
-        "or cylinders in the URDF"
+        f"geometry {type(geometry).__name__} is neither a mesh nor a box, sphere or cylinder; use "
+        "these in the URDF"
     )
 
 
@@ -210,16 +224,18 @@ def _geometry(shape: Shape) -> coal.CollisionGeometry:
     return coal.Cylinder(*shape.size)
 
 
-def _transform(T: Array) -> coal.Transform3s:
+def coal_transform(T: Array) -> coal.Transform3s:
+    """A pose `(4, 4)` as coal takes it."""
     return coal.Transform3s(T[:3, :3], T[:3, 3])
 
 
-def _distance(
+def convex_distance(
     a: coal.CollisionGeometry,
     T_a: coal.Transform3s,
     b: coal.CollisionGeometry,
     T_b: coal.Transform3s,
 ) -> float:
+    """The distance [m] between two convex geometries; negative where they overlap."""
     # A result that is not new keeps the smallest distance it has seen.
     result = coal.DistanceResult()
     return float(coal.distance(a, T_a, b, T_b, coal.DistanceRequest(), result))

@@ -20,7 +20,7 @@ from sart_toolkit.poses import (
     log_rotation,
     pose,
 )
-from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape
+from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, check_gripper
 
 _LIMIT_TOLERANCE = 1e-6
 _POSE_TOLERANCE = 1e-6
@@ -322,8 +322,7 @@ class SceneState:
     def __post_init__(self) -> None:
         object.__setattr__(self, "q", frozen(check_array("q", self.q, (None,))))
         for value in (self.gripper, self.commanded_gripper):
-            if not 0.0 <= value <= 1.0:
-                raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {value}")
+            check_gripper(value)
         poses = {k: frozen(check_pose(k, T)) for k, T in self.Ts_world_body.items()}
         object.__setattr__(self, "Ts_world_body", poses)
         positions = {

@@ -21,6 +21,7 @@ from sart_toolkit.records import (
     library_versions,
 )
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import check_gripper
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.teach.recorder import StepRecorder
 
@@ -41,8 +42,7 @@ class TeleopCommand:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "velocity", frozen(check_array("velocity", self.velocity, (6,))))
-        if not 0.0 <= self.gripper <= 1.0:
-            raise InvalidInput(f"gripper: expected 0 (open) to 1 (closed), got {self.gripper}")
+        check_gripper(self.gripper)
 
 
 class Device(abc.ABC):

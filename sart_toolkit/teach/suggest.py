@@ -60,10 +60,13 @@ class SuggestConfig:
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A suggested radius [m] (0: no room), the clearance behind it, and what limits it."""
+    """A suggested radius [m] (0: no room), the clearance behind it, and what limits it.
+
+    `clearance` [m] is `None` where it was not needed: the demonstration's phase leaves no room.
+    """
 
     radius: float
-    clearance: float
+    clearance: float | None
     limited_by: str
 
 
@@ -213,7 +216,7 @@ def _room_before_event(
     In a contact there is no room at all.
     """
     if phases[t].contacts:
-        return Suggestion(0.0, 0.0, "contact " + " / ".join(min(phases[t].contacts)))
+        return Suggestion(0.0, None, "contact " + " / ".join(min(phases[t].contacts)))
     event = next((s for s in range(t, len(phases)) if phases[s] != phases[t]), None)
     if event is None:
         return None
@@ -221,7 +224,7 @@ def _room_before_event(
     farthest = float(np.linalg.norm(p - p[0], axis=1).max())
     what = phases[t].change(phases[event])
     # A waypoint must lie outside of the sphere: a micrometre is left for that.
-    return Suggestion(max(0.0, farthest - 1e-6), 0.0, f"{what} at waypoint {event}")
+    return Suggestion(max(0.0, farthest - 1e-6), None, f"{what} at waypoint {event}")
 
 
 def suggest_annotation(
@@ -262,12 +265,12 @@ def suggest_annotation(
 
     def sphere_at(t: int) -> tuple[Suggestion, PrecisionSphere | None]:
         T_key = steps.measured_Ts_world_tool[t]
-        bodies = {name: Ts[t] for name, Ts in demonstration.body_Ts_world.items()}
-        opening = clearances(round(float(steps.measured_gripper[t]), 2))
         room = _room_before_event(demonstration, phases, t)
         if room is not None and room.radius < config.min_radius:
             found = room
         else:
+            bodies = {name: Ts[t] for name, Ts in demonstration.body_Ts_world.items()}
+            opening = clearances(round(float(steps.measured_gripper[t]), 2))
             found = suggest_radius(
                 opening, steps.joint_positions[t], T_key, bodies, config, phases[t].carried
             )
@@ -275,7 +278,7 @@ def suggest_annotation(
                 found = dataclasses.replace(room, clearance=found.clearance)
         if progress is not None:
             progress(t)
-        if found.radius < config.min_radius:
+        if found.radius < config.min_radius or found.clearance is None:
             return found, None
         # Whole micrometres, rounded down: coal's last digits depend on what it computed before.
         radius, clearance = (np.floor(x * 1e6) / 1e6 for x in (found.radius, found.clearance))
@@ -290,10 +293,12 @@ def suggest_annotation(
                 raise InvalidInput(f"waypoint {t}: expected 0 to {last - 1}; choose another")
             found, sphere = sphere_at(t)
             if sphere is None:
+                reason = found.limited_by
+                if found.clearance is not None:
+                    reason += f", clearance {found.clearance * 1e3:.1f} mm"
                 raise InvalidInput(
                     f"waypoint {t}: no room for a sphere of {config.min_radius * 1e3:.1f} mm "
-                    f"({found.limited_by}, clearance {found.clearance * 1e3:.1f} mm); choose "
-                    "another"
+                    f"({reason}); choose another"
                 )
             spheres.append(sphere)
     else:

@@ -13,7 +13,6 @@ from typing import Any
 
 import coal
 import numpy as np
-import pinocchio as pin
 
 from sart_toolkit.backends import BACKENDS
 from sart_toolkit.backends.interface import Backend, Contact, Observation
@@ -23,6 +22,7 @@ from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.robots import ROBOTS
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.scene.clearance import coal_transform, convex_distance, robot_parts
 from sart_toolkit.scene.spec import SceneSpec, SceneState
 from sart_toolkit.tables import lookup
 from sart_toolkit.testing.scenes import BLOCK_TOP, SCENES, STICK_TIP, ready_joints, site
@@ -255,13 +255,8 @@ def _opening(shapes: Sequence[_Part], Ts_world_link: dict[str, Array]) -> float:
     """The least distance [m] between parts of fingers on either side of the tool."""
     sides: tuple[list[Any], list[Any]] = ([], [])
     for link, geometry, T_link_part, side in shapes:
-        T = Ts_world_link[link] @ T_link_part
-        sides[side].append((geometry, coal.Transform3s(T[:3, :3], T[:3, 3])))
-    return min(
-        float(coal.distance(*a, *b, coal.DistanceRequest(), coal.DistanceResult()))
-        for a in sides[0]
-        for b in sides[1]
-    )
+        sides[side].append((geometry, coal_transform(Ts_world_link[link] @ T_link_part)))
+    return min(convex_distance(*a, *b) for a in sides[0] for b in sides[1])
 
 
 @functools.cache
@@ -269,28 +264,15 @@ def _finger_parts(robot_name: str) -> list[_Part]:
     """The convex parts of a robot's finger links."""
     robot = find_robot(robot_name)
     model = RobotModel(robot)
-    pinocchio_model = model.pinocchio_model
-    loaded = pin.buildGeomFromUrdf(
-        pinocchio_model,
-        str(model.urdf),
-        pin.GeometryType.COLLISION,
-        package_dirs=str(model.urdf.parent),
-    )
     T_tool_world = inverse(model.fk(robot.home))
-    parts = []
-    for item in loaded.geometryObjects:
-        frame = pinocchio_model.frames[item.parentFrame]
-        if frame.name not in robot.gripper.finger_links:
-            continue
-        geometry = item.geometry
-        if isinstance(geometry, coal.BVHModelBase):
-            geometry.buildConvexHull(True, "Qt")
-            geometry = geometry.convex
-        T_joint_link = np.array(frame.placement.homogeneous)
-        T_link_part = inverse(T_joint_link) @ np.array(item.placement.homogeneous)
-        T_tool_part = T_tool_world @ model.fk(robot.home, frame.name) @ T_link_part
-        parts.append((frame.name, geometry, T_link_part, int(T_tool_part[0, 3] > 0)))
-    return parts
+    found = []
+    for part in robot_parts(model):
+        if part.link in robot.gripper.finger_links:
+            frame = model.pinocchio_model.frames[model.pinocchio_model.getFrameId(part.link)]
+            T_link_part = inverse(np.array(frame.placement.homogeneous)) @ part.T_joint_part
+            T_tool_part = T_tool_world @ model.fk(robot.home, part.link) @ T_link_part
+            found.append((part.link, part.geometry, T_link_part, int(T_tool_part[0, 3] > 0)))
+    return found
 
 
 @functools.cache

@@ -9,6 +9,7 @@ import pytest
 from sart_toolkit.augment import engine
 from sart_toolkit.augment.engine import KEPT, AugmentConfig, try_segment
 from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.records import Annotation, PrecisionSphere, convergence_waypoint
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
@@ -92,6 +93,19 @@ def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, carrie
     reasons = [sphere.limited_by for sphere in annotation.spheres]
     assert any("gripper command at waypoint" in reason for reason in reasons)
     assert any(reason == "toolbox / table" for reason in reasons)
+
+
+def test_a_waypoint_in_a_contact_or_at_the_gripper_s_event_is_refused_with_that_reason(
+    task, model, shown, carried_at
+):
+    closing = next(s for s in range(len(shown)) if shown.steps.commanded_gripper[s] > 0.5)
+    standing = carried_at.index({"toolbox"}) + 1
+    for t, reason in (
+        (closing - 1, rf"\(gripper command at waypoint {closing}\)"),
+        (standing, r"\(contact table / toolbox\)"),
+    ):
+        with pytest.raises(InvalidInput, match=rf"waypoint {t}: no room for a sphere .* {reason}"):
+            suggest_annotation(shown, model.spec, task.scene, [t])
 
 
 def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(

@@ -20,6 +20,7 @@ from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, look_at
+from sart_toolkit.scene.clearance import primitive
 from sart_toolkit.scene.spec import Body, Detent, Joint, Light, SceneSpec
 from sart_toolkit.workers import worker_map
 
@@ -592,8 +593,8 @@ def test_without_sapien_the_extra_is_named():
 
 
 def test_a_shape_that_is_not_known_is_refused():
-    with pytest.raises(InvalidInput, match="Capsule"):
-        sapien_pictures.primitive(coal.Capsule(0.1, 0.2), np.eye(4))
+    with pytest.raises(InvalidInput, match="geometry Capsule is neither a mesh nor a box, sphere"):
+        primitive(coal.Capsule(0.1, 0.2))
 
 
 def test_a_joint_without_limits_is_refused(monkeypatch, tmp_path):
