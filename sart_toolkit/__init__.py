@@ -9,8 +9,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
+    from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.augment.engine import augment_demonstration
     from sart_toolkit.augment.strategies import SamplingConfig
+    from sart_toolkit.augment.validate import validate_dataset
     from sart_toolkit.backends import make_backend
     from sart_toolkit.evaluate.report import write_report
     from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
@@ -19,6 +21,9 @@ if TYPE_CHECKING:
     from sart_toolkit.robots import get_robot
     from sart_toolkit.robots.model import RobotModel
     from sart_toolkit.scene.appearance import vary_appearance
+    from sart_toolkit.scene.certificate import certify
+    from sart_toolkit.scene.collision import CollisionModel
+    from sart_toolkit.scene.demonstrated import DemonstratedScene
     from sart_toolkit.storage import (
         load_annotation,
         load_dataset,
@@ -31,11 +36,14 @@ if TYPE_CHECKING:
     from sart_toolkit.teach.replay import replay_demonstration
     from sart_toolkit.teach.scripted import ScriptedOperator
     from sart_toolkit.teach.session import record_demonstration
-    from sart_toolkit.teach.suggest import SuggestConfig, suggest_annotation
+    from sart_toolkit.teach.suggest import ExactSurroundings, SuggestConfig, suggest_annotation
 
 _HOMES = {
-    "AugmentConfig": "augment.engine",
+    "AugmentConfig": "augment.config",
+    "CollisionModel": "scene.collision",
+    "DemonstratedScene": "scene.demonstrated",
     "EvaluateConfig": "evaluate.rollout",
+    "ExactSurroundings": "teach.suggest",
     "Placement": "tasks.task",
     "RobotModel": "robots.model",
     "SamplingConfig": "augment.strategies",
@@ -43,6 +51,7 @@ _HOMES = {
     "SuggestConfig": "teach.suggest",
     "TrainConfig": "learn.training",
     "augment_demonstration": "augment.engine",
+    "certify": "scene.certificate",
     "evaluate_skill": "evaluate.rollout",
     "get_robot": "robots",
     "get_task": "tasks",
@@ -58,12 +67,16 @@ _HOMES = {
     "save_skill": "learn.skill",
     "suggest_annotation": "teach.suggest",
     "train": "learn.training",
+    "validate_dataset": "augment.validate",
     "vary_appearance": "scene.appearance",
     "write_report": "evaluate.report",
 }
 __all__ = [
     "AugmentConfig",
+    "CollisionModel",
+    "DemonstratedScene",
     "EvaluateConfig",
+    "ExactSurroundings",
     "Placement",
     "RobotModel",
     "SamplingConfig",
@@ -71,6 +84,7 @@ __all__ = [
     "SuggestConfig",
     "TrainConfig",
     "augment_demonstration",
+    "certify",
     "evaluate_skill",
     "get_robot",
     "get_task",
@@ -86,6 +100,7 @@ __all__ = [
     "save_skill",
     "suggest_annotation",
     "train",
+    "validate_dataset",
     "vary_appearance",
     "write_report",
 ]

@@ -398,11 +398,18 @@ class Episode:
     """One generated trajectory: the reversed segment's steps, then the demonstration from `t_star`.
 
     The segment's last step is followed by the demonstration's step `provenance.t_star`; that
-    suffix is stored once, in the demonstration.
+    suffix is stored once, in the demonstration. `joint_path (m, n)` [rad]: the joints as they were
+    measured while the segment was executed, from t* outwards, at the backend's own rate.
     """
 
     steps: Steps
     provenance: Provenance
+    joint_path: Array
+
+    def __post_init__(self) -> None:
+        n = self.steps.joint_positions.shape[1]
+        path = check_array("joint_path", self.joint_path, (None, n))
+        object.__setattr__(self, "joint_path", frozen(path))
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -426,7 +433,9 @@ class Episode:
         """SHA-256 over the steps and their provenance."""
         provenance = dataclasses.asdict(self.provenance)
         provenance["T_world_sampled"] = self.provenance.T_world_sampled.tolist()
-        return digest({**self.steps.content(), "provenance": provenance})
+        return digest(
+            {**self.steps.content(), "joint_path": self.joint_path, "provenance": provenance}
+        )
 
 
 @dataclass(frozen=True)

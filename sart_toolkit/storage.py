@@ -40,7 +40,7 @@ from sart_toolkit.records import (
     Steps,
 )
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 
 # --- writing safely -----------------------------------------------------------------------------
@@ -376,6 +376,7 @@ def save_episode(path: Path, episode: Episode) -> None:
     provenance["T_world_sampled"] = episode.provenance.T_world_sampled.tolist()
     with _writing(path, "episode") as file:
         _put_steps(file.create_group("steps"), episode.steps)
+        file["joint_path"] = episode.joint_path
         file.attrs["provenance"] = json.dumps(provenance)
         file.attrs["content_hash"] = episode.content_hash()
 
@@ -389,7 +390,7 @@ def load_episode(path: Path) -> Episode:
     """
     with _reading(path, "episode") as file:
         provenance = Provenance(**json.loads(file.attrs["provenance"]))
-        episode = Episode(steps=_get_steps(file["steps"]), provenance=provenance)
+        episode = Episode(_get_steps(file["steps"]), provenance, file["joint_path"][()])
         if file.attrs["content_hash"] != episode.content_hash():
             raise BrokenFile(f"{path}: content differs from its hash; generate it again")
         return episode

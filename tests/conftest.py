@@ -9,17 +9,19 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import make_backend
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.records import Annotation, Dataset, Demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import suggest_annotation
+from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 PICTURE_SIZE = 48
 
@@ -71,9 +73,15 @@ def peg_demonstration(
 
 
 @pytest.fixture(scope="session")
-def peg_annotation(peg_task: Task, peg_demonstration: Demonstration) -> Annotation:
+def peg_scene(peg_task: Task, peg_demonstration: Demonstration) -> DemonstratedScene:
+    """Collision models of `peg_demonstration`'s waypoints."""
+    return DemonstratedScene(peg_demonstration, get_robot(peg_task.robot), peg_task.scene)
+
+
+@pytest.fixture(scope="session")
+def peg_annotation(peg_demonstration: Demonstration, peg_scene: DemonstratedScene) -> Annotation:
     """The spheres suggested for `peg_demonstration`."""
-    return suggest_annotation(peg_demonstration, get_robot(peg_task.robot), peg_task.scene)
+    return suggest_annotation(peg_demonstration, ExactSurroundings(peg_scene))
 
 
 @pytest.fixture(scope="session")

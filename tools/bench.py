@@ -22,7 +22,8 @@ import numpy as np
 import torch
 
 from sart_toolkit import doctor
-from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.errors import SartError, unknown_name
@@ -52,11 +53,12 @@ from sart_toolkit.records import (
 )
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import suggest_annotation
+from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 _DEMONSTRATION_STEPS = 60
 _SEGMENT_STEPS = 20
@@ -256,7 +258,8 @@ def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
     plan = task.plan(task.initial_state(model, Placement()))
     operator = ScriptedOperator(plan, np.random.default_rng(0))
     demonstration = record_demonstration(make(), task, model, operator)
-    annotation = suggest_annotation(demonstration, robot, task.scene)
+    scene = DemonstratedScene(demonstration, robot, task.scene)
+    annotation = suggest_annotation(demonstration, ExactSurroundings(scene))
     per_second, over_wall = [], []
     with tempfile.TemporaryDirectory() as scratch:
         for turn in range(options.repeats):

@@ -1,4 +1,4 @@
-"""Generates trajectories: executes each segment, checks it, records it reversed, and resumes."""
+"""Generates datasets: tries segments until enough are kept, counts the others, and resumes."""
 
 from __future__ import annotations
 
@@ -10,38 +10,26 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sart_toolkit.augment.strategies import SamplingConfig, get_strategy
-from sart_toolkit.backends.interface import Backend, BackendFactory, Observation
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.segments import KEPT, SegmentMaker
+from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.errors import (
     BrokenFile,
     InvalidInput,
     Mismatch,
     MissingCapability,
-    MotionRejected,
     OutputExists,
-    Unreachable,
     unknown_name,
 )
-from sart_toolkit.motion.controller import ToolController
-from sart_toolkit.motion.line import straight_line
-from sart_toolkit.poses import check_positive, distance, inverse
 from sart_toolkit.records import (
-    CONTROL_PER_RECORD,
-    RECORD_HZ,
     Annotation,
     Dataset,
     Demonstration,
-    Episode,
-    Provenance,
     library_versions,
 )
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.storage import (
     annotation_to_json,
     append_json_line,
@@ -59,137 +47,12 @@ from sart_toolkit.storage import (
     write_json,
     write_text,
 )
-from sart_toolkit.teach.recorder import StepRecorder
 from sart_toolkit.workers import worker_map
 
 _log = logging.getLogger(__name__)
-KEPT = "kept"
 _LOG = "attempts.jsonl"
 _LEAST_ATTEMPTS = 20
 _ATTEMPTS_PER_EPISODE = 10
-_SLIP, _SLIP_DEG = 0.005, 3.0
-
-
-@dataclass(frozen=True)
-class AugmentConfig:
-    """What to generate.
-
-    `n`: trajectories in all, the demonstration among them; the others go round-robin over the
-    spheres. `duration` [s] is the paper's delta. `camera`: whose pictures are recorded.
-    """
-
-    n: int = 40
-    strategy: str = "sart"
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    duration: float = 2.0
-    seed: int = 0
-    camera: str = "wrist"
-
-    def __post_init__(self) -> None:
-        if self.n < 2:
-            raise InvalidInput(f"n: expected at least 2 (the demonstration counts), got {self.n}")
-        if self.seed < 0:
-            raise InvalidInput(f"seed: expected a whole number >= 0, got {self.seed}")
-        check_positive("duration", self.duration, "s")
-        get_strategy(self.strategy)
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """The outcome of one try: the episode, or the reason why it was rejected."""
-
-    outcome: str
-    episode: Episode | None
-
-
-def try_segment(
-    backend: Backend,
-    model: RobotModel,
-    demonstration: Demonstration,
-    annotation: Annotation,
-    config: AugmentConfig,
-    sphere_index: int,
-    k: int,
-) -> Attempt:
-    """The k-th try from a sphere: sample, move there, check, and reverse what was recorded.
-
-    The robot starts from the restored state of waypoint t*, at the pose commanded there. Any
-    contact of the robot, or of what it holds or has grasped there, with anything else at any
-    physics step rejects the segment; so does an object that slips in the grasp.
-
-    Args:
-        backend: the robot in the demonstration's scene.
-        model: its kinematics.
-        demonstration: what was shown.
-        annotation: its spheres.
-        config: what to generate.
-        sphere_index: which sphere.
-        k: which try; it alone decides the random numbers, with the seed and the sphere.
-
-    Raises:
-        MissingCapability: the backend can't restore states or report contacts.
-    """
-    rng = np.random.default_rng([config.seed, sphere_index, k])
-    sphere = annotation.spheres[sphere_index]
-    proposal = get_strategy(config.strategy)(demonstration, sphere, rng, config.sampling)
-    t_star = proposal.t_star
-    steps = demonstration.steps
-    q_start = steps.commanded_joint_positions[t_star]
-    T_start = steps.commanded_Ts_world_tool[t_star]
-    gripper = float(steps.commanded_gripper[t_star])
-    scene = backend.scene
-    carried = scene.grasped(demonstration.touching[t_star], backend.robot.gripper.finger_links)
-    controller = ToolController(model)
-    try:
-        line = straight_line(model, q_start, T_start, proposal.T_world_sampled, config.duration)
-        backend.restore(demonstration.states[t_star])
-        controller.reset(q_start, T_start)
-        recorder = StepRecorder(backend, (config.camera,))
-        start = backend.observe()
-        measured = start.T_world_tool
-        for desired in line.sample(RECORD_HZ):
-            for q in controller.move(desired, measured, CONTROL_PER_RECORD):
-                backend.command(q, gripper)
-                backend.step()
-                hits = _hits(backend, carried)
-                if hits:
-                    return Attempt(f"contact {hits[0][0]} / {hits[0][1]}", None)
-            if not np.allclose(controller.commanded_T_world_tool, desired, rtol=0, atol=1e-9):
-                return Attempt("tool lags behind the line", None)
-            measured = recorder.add(controller, gripper, 0.0).T_world_tool
-        for name in sorted(carried):
-            if _slipped(name, start, recorder.observations[-1]):
-                return Attempt(f"{name} slipped in the grasp", None)
-    except Unreachable:
-        return Attempt("out of reach", None)
-    except MotionRejected as error:
-        # "joint jump: ..." or "joint limits: ...": the figures behind the colon differ each time.
-        return Attempt(str(error).partition(":")[0], None)
-    provenance = Provenance(
-        demonstration_hash=annotation.demonstration_hash,
-        sphere=sphere_index,
-        k=k,
-        t_star=t_star,
-        T_world_sampled=proposal.T_world_sampled,
-        seed=config.seed,
-        strategy=config.strategy,
-        law=config.sampling.law,
-    )
-    return Attempt(KEPT, Episode(recorder.steps(slice(None, None, -1)), provenance))
-
-
-def _hits(backend: Backend, carried: frozenset[str]) -> list[tuple[str, str]]:
-    """Contacts of the last step that should not be: of the robot with itself, and outer ones."""
-    touching = [(contact.a, contact.b) for contact in backend.contacts()]
-    bodies = {body.name for body in backend.scene.bodies}
-    itself = [pair for pair in touching if bodies.isdisjoint(pair)]
-    return sorted([*itself, *backend.scene.outer_contacts(touching, carried)])
-
-
-def _slipped(name: str, start: Observation, end: Observation) -> bool:
-    Ts = [inverse(seen.T_world_tool) @ seen.Ts_world_body[name] for seen in (start, end)]
-    far, turn = distance(*Ts)
-    return far > _SLIP or turn > np.deg2rad(_SLIP_DEG)
 
 
 class _Worker:
@@ -199,23 +62,17 @@ class _Worker:
         self, make_backend: BackendFactory, directory: Path, config: AugmentConfig
     ) -> None:
         self._directory = directory
-        self._config = config
-        self._demonstration = load_demonstration(directory / "demo.h5")
-        self._annotation = load_annotation(directory / "annotation.json")
         self._backend = make_backend()
-        self._model = RobotModel(self._backend.robot, self._backend.scene.held)
+        self._try = SegmentMaker(
+            self._backend,
+            load_demonstration(directory / "demo.h5"),
+            load_annotation(directory / "annotation.json"),
+            config,
+        )
 
     def __call__(self, at: tuple[int, int]) -> tuple[int, int, str]:
         sphere, k = at
-        attempt = try_segment(
-            self._backend,
-            self._model,
-            self._demonstration,
-            self._annotation,
-            self._config,
-            sphere,
-            k,
-        )
+        attempt = self._try(sphere, k)
         if attempt.episode is not None:
             save_episode(self._directory / "episodes" / episode_name(sphere, k), attempt.episode)
         return sphere, k, attempt.outcome
@@ -251,7 +108,7 @@ def augment_demonstration(
 
     Raises:
         Mismatch: the annotation belongs to another demonstration.
-        MissingCapability: the backend can't restore states or report contacts.
+        MissingCapability: the backend can't restore states or render.
         OutputExists: `out` holds something else and `overwrite` is false.
         CannotWrite: the disk refuses.
         InvalidInput: no try from any sphere was kept, or `workers` is not positive.
@@ -347,15 +204,15 @@ def _next_batch(outcomes: dict[tuple[int, int], str], quotas: list[int]) -> list
     return sorted(batch, key=lambda at: (at[1], at[0]))
 
 
-def _check_capable(make_backend: BackendFactory, camera: str) -> None:
+def _check_capable(make_backend: BackendFactory, camera: str | None) -> None:
     with closing(make_backend()) as backend:
         can = backend.capabilities
-        if camera not in backend.cameras:
+        if camera is not None and camera not in backend.cameras:
             raise unknown_name("camera", camera, backend.cameras)
-        if not (can.can_restore and can.has_contacts and can.renders):
+        if not (can.can_restore and (camera is None or can.renders)):
             raise MissingCapability(
-                f"backend {backend.name!r} can't restore states, report contacts and render, which "
-                "augmentation needs; use another backend"
+                f"backend {backend.name!r} can't restore states and render, which augmentation "
+                "needs; use another backend"
             )
 
 
@@ -384,6 +241,10 @@ def _finish(
         "n_kept": len(kept),
         "n_attempted": len(outcomes),
         "rejections": dict(sorted(reasons.items())),
+        "spheres": [
+            _tally(sphere.waypoint, [o for (s, _), o in outcomes.items() if s == i])
+            for i, sphere in enumerate(annotation.spheres)
+        ],
         "seconds": seconds,
         "simulated_seconds": len(outcomes) * request["config"]["duration"],
         "config": request["config"],
@@ -393,6 +254,16 @@ def _finish(
     }
     write_json(out / "dataset.json", info)
     return dataclasses.replace(dataset, info=info)
+
+
+def _tally(waypoint: int, outcomes: list[str]) -> dict[str, Any]:
+    """How the tries from one sphere ended."""
+    reasons = collections.Counter(outcome for outcome in outcomes if outcome != KEPT)
+    return {
+        "waypoint": waypoint,
+        "kept": len(outcomes) - reasons.total(),
+        "rejections": dict(sorted(reasons.items())),
+    }
 
 
 def _counted(reasons: collections.Counter[str]) -> str:

@@ -1,4 +1,4 @@
-"""Where an augmented segment leads from and to.
+"""Where an augmented segment leads from and to, and whether its path may bend.
 
 A new strategy is one function and one line in `STRATEGIES`.
 """
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sart_toolkit.errors import InvalidInput, unknown_name
+from sart_toolkit.motion.planning import check_planner
 from sart_toolkit.poses import Array, exp_rotation, frozen, orthonormalised
 from sart_toolkit.records import (
     ROTATION_PER_METRE,
@@ -49,7 +50,25 @@ class SamplingConfig:
             )
 
 
-Strategy = Callable[[Demonstration, PrecisionSphere, np.random.Generator, SamplingConfig], Proposal]
+Propose = Callable[[Demonstration, PrecisionSphere, np.random.Generator, SamplingConfig], Proposal]
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """Draws segments by calling `propose`; where it `plans`, they may bend round obstacles."""
+
+    propose: Propose
+    plans: bool = False
+
+    def __call__(
+        self,
+        demonstration: Demonstration,
+        sphere: PrecisionSphere,
+        rng: np.random.Generator,
+        config: SamplingConfig,
+    ) -> Proposal:
+        """The segment that `propose` draws."""
+        return self.propose(demonstration, sphere, rng, config)
 
 
 def sample_direction(rng: np.random.Generator, law: str) -> Array:
@@ -81,15 +100,43 @@ def sart(
     Position Eq. (rand_pos): p = c + r [sin phi cos psi, sin phi sin psi, cos phi]. Rotation
     Eq. (rand_ori): R = C dR, its angle within nu_r r. Joining point Eq. (target_pose).
     """
+    return _proposal(demonstration, sphere, sphere.radius, rng, config)
+
+
+def sart_planned(
+    demonstration: Demonstration,
+    sphere: PrecisionSphere,
+    rng: np.random.Generator,
+    config: SamplingConfig,
+) -> Proposal:
+    """A pose in a free-space region, anywhere in its volume; else as the paper's strategy has it.
+
+    In a `free_space` region p = c + r u^(1/3) d, u ~ U[0, 1] and d a direction by the sampling law:
+    by law `area` it is uniform in the ball. Rotation and joining point are those of `sart`.
+    """
+    distance = sphere.radius
+    if sphere.kind == "free_space":
+        distance *= float(np.cbrt(rng.uniform()))
+    return _proposal(demonstration, sphere, distance, rng, config)
+
+
+def _proposal(
+    demonstration: Demonstration,
+    sphere: PrecisionSphere,
+    distance: float,
+    rng: np.random.Generator,
+    config: SamplingConfig,
+) -> Proposal:
+    """A pose at a distance [m] from a sphere's key pose, and where to rejoin."""
     T = np.eye(4)
     direction = sample_direction(rng, config.law)
-    T[:3, 3] = sphere.T_world_key[:3, 3] + sphere.radius * direction
+    T[:3, 3] = sphere.T_world_key[:3, 3] + distance * direction
     dR = sample_rotation(rng, config.rotation_per_metre * sphere.radius)
     T[:3, :3] = orthonormalised(sphere.T_world_key[:3, :3] @ dR)
     return Proposal(convergence_waypoint(demonstration, sphere), T)
 
 
-STRATEGIES: dict[str, Strategy] = {"sart": sart}
+STRATEGIES = {"sart": Strategy(sart), "sart_planned": Strategy(sart_planned, plans=True)}
 
 
 def get_strategy(name: str) -> Strategy:
@@ -97,7 +144,11 @@ def get_strategy(name: str) -> Strategy:
 
     Raises:
         UnknownName: no such strategy; the message offers the nearest.
+        MissingExtra: it plans, and OMPL isn't installed.
     """
     if name not in STRATEGIES:
         raise unknown_name("strategy", name, STRATEGIES)
-    return STRATEGIES[name]
+    strategy = STRATEGIES[name]
+    if strategy.plans:
+        check_planner()
+    return strategy

@@ -6,6 +6,8 @@ import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from sart_toolkit.errors import InvalidInput, MissingCapability, unknown_name
 from sart_toolkit.poses import Array
 from sart_toolkit.records import DepthImage, Image
@@ -47,6 +49,9 @@ class Observation:
 
     `q`, `dq (n,)` [rad, rad/s]; `gripper` in [0, 1]; `T_world_tool (4,4)`; `time` [s] since reset;
     `cameras` holds the pictures asked for; `Ts_world_body` the simulated bodies, held ones too.
+    `joint_path (m, n)` [rad]: where the joints were during the last control period, measured as
+    often as the backend can (our simulators: after each physics step), oldest first, the last row
+    being `q`; no rows after `reset` or `restore`, and where the backend doesn't measure it.
     """
 
     q: Array
@@ -56,6 +61,11 @@ class Observation:
     time: float
     cameras: Mapping[str, CameraView] = field(default_factory=dict)
     Ts_world_body: Mapping[str, Array] = field(default_factory=dict)
+    joint_path: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    def __post_init__(self) -> None:
+        if len(self.joint_path) == 0:
+            object.__setattr__(self, "joint_path", np.empty((0, len(self.q))))
 
 
 @dataclass(frozen=True)

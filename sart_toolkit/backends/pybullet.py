@@ -104,6 +104,7 @@ class PyBulletBackend(Backend):
         self._names = {at: name for name, at in self._bodies.items()}
         self._names |= {(self._robot, i): name for name, i in self._links.items()}
         self._touched: dict[tuple[str, str], tuple[float, float]] = {}
+        self._joint_path: list[list[float]] = []
         self._time = 0.0
         self._scene_digest = scene_digest(self._model, scene)
         n = len(robot.arm_joints)
@@ -247,6 +248,7 @@ class PyBulletBackend(Backend):
             time=self._time,
             cameras={name: self._picture(name, Ts, size) for name in cameras},
             Ts_world_body=Ts_body,
+            joint_path=np.array(self._joint_path),
         )
 
     def _link_pose(self, index: int, link: int) -> Array:
@@ -288,6 +290,7 @@ class PyBulletBackend(Backend):
         ones = [1.0] * n
         gripper = self.robot.gripper
         self._touched = {}
+        self._joint_path = []
         self._restored = None
         for i in range(1, _STEPS + 1):
             target = self._last_target + (i / _STEPS) * (self._target - self._last_target)
@@ -306,6 +309,7 @@ class PyBulletBackend(Backend):
                 effort = joint.effort(c.getJointState(index, link)[0])
                 c.setJointMotorControl2(index, link, p.TORQUE_CONTROL, force=effort)
             c.stepSimulation()
+            self._joint_path.append([s[0] for s in c.getJointStates(robot, arm)])
             self._collect_contacts()
         self._last_target = self._target
         self._time += 1.0 / CONTROL_HZ
@@ -367,6 +371,7 @@ class PyBulletBackend(Backend):
         self._last_target = np.array(head["last_target"])
         self._time = head["time"]
         self._touched = {}
+        self._joint_path = []
         self._restored = state
 
     def close(self) -> None:

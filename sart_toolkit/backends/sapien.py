@@ -36,7 +36,7 @@ from sart_toolkit.poses import Array
 from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec, Shape, check_gripper, mass_properties
-from sart_toolkit.scene.clearance import primitive
+from sart_toolkit.scene.collision import primitive
 from sart_toolkit.scene.spec import Body, Joint, SceneSpec, SceneState
 
 _STEPS = PHYSICS_HZ // CONTROL_HZ
@@ -136,7 +136,7 @@ class SapienBackend(Backend):
             self.capabilities = dataclasses.replace(self.capabilities, renders=False)
         self._pictures: Pictures | None = None
         self._model = RobotModel(robot, scene.held)
-        self._robot = _RobotParts(robot, self._model)
+        self._robot = _ConvexParts(robot, self._model)
         self._scene_digest = scene_digest(self._model, scene)
         self._physics: _Physics | None = None
         bodies = {body.name: body.T_world_body for body in scene.bodies if body.joint is None}
@@ -174,6 +174,7 @@ class SapienBackend(Backend):
         self._target = self._last_target = target
         self._periods = 0
         self._touched: dict[tuple[str, str], tuple[float, float]] = {}
+        self._joint_path: list[Array] = []
 
     def _running(self) -> _Physics:
         if self._physics is None:
@@ -200,6 +201,7 @@ class SapienBackend(Backend):
             time=self._periods / CONTROL_HZ,
             cameras=self._take(cameras, size, Ts_body) if cameras else {},
             Ts_world_body=Ts_body,
+            joint_path=np.array(self._joint_path),
         )
 
     def _take(
@@ -224,9 +226,11 @@ class SapienBackend(Backend):
     def step(self) -> None:
         physics = self._running()
         self._touched = {}
+        self._joint_path = []
         for i in range(1, _STEPS + 1):
             target = self._last_target + (i / _STEPS) * (self._target - self._last_target)
             physics.advance(target[:-1], self.robot.gripper.closed_position * float(target[-1]))
+            self._joint_path.append(physics.arm_positions())
             for pair, (force, penetration) in physics.contacts().items():
                 old = self._touched.get(pair, (0.0, 0.0))
                 self._touched[pair] = max(old[0], force), max(old[1], penetration)
@@ -263,7 +267,7 @@ class SapienBackend(Backend):
         self._physics = self._pictures = None
 
 
-class _RobotParts:
+class _ConvexParts:
     """The robot's joints and convex parts as its URDF has them, links without joints merged.
 
     Attributes:
@@ -342,7 +346,7 @@ class _RobotParts:
 class _Physics:
     """Robot and bodies in PhysX, started at a moment."""
 
-    def __init__(self, robot: _RobotParts, scene: SceneSpec, moment: _Moment) -> None:
+    def __init__(self, robot: _ConvexParts, scene: SceneSpec, moment: _Moment) -> None:
         with _scene_config(scene.gravity):
             self._system = sapien.physx.PhysxCpuSystem()
         self._system.timestep = 1.0 / PHYSICS_HZ
@@ -369,7 +373,7 @@ class _Physics:
             else:
                 self._add_free(body, body.mass, moment)
 
-    def _add_robot(self, robot: _RobotParts, moment: _Moment) -> None:
+    def _add_robot(self, robot: _ConvexParts, moment: _Moment) -> None:
         model, gripper = robot.model, robot.spec.gripper
         links: list[Any] = []
         for j in range(model.njoints):
@@ -393,6 +397,7 @@ class _Physics:
         self._order = [links.index(joint.child_link) - 1 for joint in self._robot.active_joints]
         _place(self._robot, moment.q[self._order], moment.dq[self._order])
         self._arm = [links[at + 1].joint for at in robot.arm]
+        self._arm_order = [self._order.index(at) for at in robot.arm]
         # Stiff springs hold each joint of the linkage to its ratio times s, one number for all.
         self._linkage = [(links[j].joint, ratio) for j, ratio in robot.linkage.items()]
         squared = sum(ratio**2 for _, ratio in self._linkage)
@@ -503,6 +508,10 @@ class _Physics:
                 effort = joint.effort(float(articulation.qpos[0]))
                 articulation.set_qf(np.array([effort], np.float32))
         self._system.step()
+
+    def arm_positions(self) -> Array:
+        """Where the arm's joints `(n,)` [rad] are now."""
+        return np.array(self._robot.qpos[self._arm_order], np.float64)
 
     def contacts(self) -> dict[tuple[str, str], tuple[float, float]]:
         """Force [N] and penetration [m] of each pair that touched in the last step."""

@@ -27,7 +27,7 @@ from sart_toolkit.errors import CannotWrite, MissingCapability, MissingExtra
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.spec import CameraSpec, Shape
 from sart_toolkit.robots.urdf import cache_dir
-from sart_toolkit.scene.clearance import primitive
+from sart_toolkit.scene.collision import primitive
 from sart_toolkit.scene.spec import Light, SceneSpec
 
 try:

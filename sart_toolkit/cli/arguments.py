@@ -98,6 +98,8 @@ class Suggest:
     Example: sart suggest demo.h5 --out annotation.json
 
     Example: sart suggest demo.h5 --out annotation.json --waypoints 0 18 --margin 0.005
+
+    Example: sart suggest demo.h5 --out annotation.json --source cloud
     """
 
     demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
@@ -105,7 +107,17 @@ class Suggest:
     waypoints: Annotated[
         tuple[int, ...], arg(help="Key waypoints; chosen to tile the free part if left out.")
     ] = ()
-    margin: Annotated[float, arg(help="Distance that stays free everywhere [m].")] = 0.002
+    source: Annotated[
+        Literal["scene", "cloud"],
+        arg(help="What is known of obstacles: the simulated scene, or the recorded RGB-D alone."),
+    ] = "scene"
+    unknown: Annotated[
+        Literal["behind", "free"],
+        arg(help="With --source cloud: space behind what was seen counts as solid, or as free."),
+    ] = "behind"
+    margin: Annotated[float, arg(help="Distance that stays free of the tool everywhere [m].")] = (
+        0.0005
+    )
     min_radius: Annotated[float, arg(help="Smallest sphere worth having [m].")] = 0.004
     max_radius: Annotated[float, arg(help="Largest sphere [m].")] = 0.15
     overwrite: _OVERWRITE = False
@@ -135,10 +147,28 @@ class Augment:
     rotation_per_metre: Annotated[
         float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")
     ] = 2.0
-    duration: Annotated[float, arg(help="Seconds each segment takes, delta.")] = 2.0
+    duration: Annotated[
+        float, arg(help="Seconds each segment takes, delta; more where the joints need it.")
+    ] = 2.0
+    margin: Annotated[
+        float, arg(help="Distance that every segment is proved to keep free [m].")
+    ] = 0.0002
     seed: _SEED = 0
     workers: _WORKERS = 1
     overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Validate:
+    """Prove a dataset's segments clear again, and check its hashes and reversals.
+
+    Example: sart validate dataset
+    """
+
+    dataset: Annotated[
+        Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment`.")
+    ]
     json: _JSON = False
 
 
@@ -298,6 +328,7 @@ Verb = (
     | Annotated[Record, tyro.conf.subcommand("record")]
     | Annotated[Suggest, tyro.conf.subcommand("suggest")]
     | Annotated[Augment, tyro.conf.subcommand("augment")]
+    | Annotated[Validate, tyro.conf.subcommand("validate")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[

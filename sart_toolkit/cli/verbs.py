@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit import doctor
-from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.strategies import SamplingConfig
+from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.cli.arguments import (
@@ -31,6 +33,7 @@ from sart_toolkit.cli.arguments import (
     Run,
     Suggest,
     Train,
+    Validate,
 )
 from sart_toolkit.cli.console import progress_bar, say, show
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
@@ -48,6 +51,8 @@ from sart_toolkit.records import Dataset, Demonstration, library_versions
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scene.appearance import vary_appearance
+from sart_toolkit.scene.cloud import CloudConfig
+from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.storage import (
     check_writable,
     clear_directory,
@@ -62,9 +67,15 @@ from sart_toolkit.storage import (
 )
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.teach.cloud import CloudSurroundings
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import SuggestConfig, suggest_annotation
+from sart_toolkit.teach.suggest import (
+    ExactSurroundings,
+    SuggestConfig,
+    Surroundings,
+    suggest_annotation,
+)
 
 Result = dict[str, Any]
 
@@ -131,11 +142,17 @@ def suggest_verb(args: Suggest) -> Result:
         margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius
     )
     check_writable(args.out, args.overwrite)
+    robot = get_robot(demonstration.robot)
+    surroundings: Surroundings
+    if args.source == "cloud":
+        cloud = CloudConfig(unknown=args.unknown)
+        surroundings = CloudSurroundings(demonstration, robot, task.scene, cloud)
+    else:
+        surroundings = ExactSurroundings(DemonstratedScene(demonstration, robot, task.scene))
     with progress_bar("suggest", len(demonstration), "waypoint") as bar:
         annotation = suggest_annotation(
             demonstration,
-            get_robot(demonstration.robot),
-            task.scene,
+            surroundings,
             args.waypoints or None,
             config,
             progress=lambda t: bar.update(t + 1 - bar.n),
@@ -164,6 +181,7 @@ def augment_verb(args: Augment) -> Result:
         strategy=args.strategy,
         sampling=SamplingConfig(args.law, args.rotation_per_metre),
         duration=args.duration,
+        margin=args.margin,
         seed=args.seed,
     )
     task = get_task(demonstration.task)
@@ -187,6 +205,32 @@ def augment_verb(args: Augment) -> Result:
             progress,
         )
     return {"dataset": str(args.out), **_describe_dataset(dataset)}
+
+
+def validate_verb(args: Validate) -> Result:
+    """`sart validate`."""
+    demonstration = load_demonstration(args.dataset / "demo.h5")
+    task = get_task(demonstration.task)
+    with progress_bar("validate", None, "episode") as bar:
+
+        def progress(done: int, wanted: int) -> None:
+            bar.total = wanted
+            bar.update(done - bar.n)
+
+        found = validate_dataset(args.dataset, get_robot(demonstration.robot), task.scene, progress)
+    for name, problem in found.problems.items():
+        say(f"{name}: {problem}")
+    if found.problems:
+        raise Mismatch(
+            f"{args.dataset}: {len(found.problems)} of {found.episodes} episodes don't hold; "
+            "generate them again"
+        )
+    return {
+        "dataset": str(args.dataset),
+        "episodes": found.episodes,
+        "least_clearance_mm": round(found.least_clearance * 1e3, 3),
+        "largest_deviation_mm": round(found.largest_deviation * 1e3, 3),
+    }
 
 
 def train_verb(args: Train) -> Result:
@@ -502,6 +546,7 @@ _VERBS: dict[type, Callable[[Any], Result]] = {
     Record: record_verb,
     Suggest: suggest_verb,
     Augment: augment_verb,
+    Validate: validate_verb,
     Train: train_verb,
     Evaluate: evaluate_verb,
     BenchmarkOperator: benchmark_operator_verb,

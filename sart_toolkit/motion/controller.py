@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sart_toolkit.errors import InvalidInput
+from sart_toolkit.errors import InvalidInput, MotionRejected
 from sart_toolkit.poses import (
     Array,
     angle_between,
     check_pose,
     check_positive,
+    distance,
     exp_rotation,
     interpolate,
     log_rotation,
@@ -107,6 +108,25 @@ class ToolController:
             q = targets[i] = self.model.ik(T, q, self.config.max_joint_step)
         self._q, self._T = q.copy(), goal
         return targets
+
+    def follow(self, q: Array, T_world_tool: Array, measured_T_world_tool: Array) -> None:
+        """Take the next joint target `(n,)` of a motion planned before, and the pose it stands for.
+
+        Nothing changes if an error is raised.
+
+        Raises:
+            InvalidInput: not a joint configuration, or not a pose.
+            MotionRejected: the pose is farther from the measured one than a command may be.
+        """
+        measured = check_pose("measured_T_world_tool", measured_T_world_tool)
+        T = check_pose("T_world_tool", T_world_tool)
+        if not np.array_equal(self.clamped(T, measured), T):
+            far, turn = distance(measured, T)
+            raise MotionRejected(
+                f"tool lags behind: {far * 1e3:.0f} mm and {np.rad2deg(turn):.0f} deg; allow more "
+                "time"
+            )
+        self._q, self._T = self.model.check_q(q), T
 
     def clamped(self, desired: Array, measured: Array) -> Array:
         """The pose nearest to `desired` within the allowed lead of `measured`, both `(4, 4)`."""

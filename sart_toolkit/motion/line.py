@@ -1,53 +1,19 @@
-"""Straight tool lines in time: p linear, R geodesic, timed by Ruckig within the joints' limits."""
+"""Straight tool lines: p linear, R geodesic, by a smooth joint path on one branch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
 
 import numpy as np
-from ruckig import InputParameter, Result, Ruckig, Trajectory
-from scipy.interpolate import make_interp_spline
 
 from sart_toolkit.errors import MotionRejected
-from sart_toolkit.poses import Array, check_pose, check_positive, interpolate
+from sart_toolkit.motion.path import SplinePath
+from sart_toolkit.motion.timing import Motion, timed
+from sart_toolkit.poses import Array, check_pose, check_positive, distance, interpolate
 from sart_toolkit.robots.model import RobotModel
 
-_KNOTS = 25
-_RAMP = 0.25
-_JERK_SHARE = 0.4
-
-
-@dataclass(frozen=True)
-class StraightLine:
-    """A timed straight tool line at rest at both ends.
-
-    Attributes:
-        T_world_start, T_world_end: end poses `(4, 4)`.
-        duration: seconds.
-        knots: `(m, n)` joint configurations at equal steps of the path parameter s in [0, 1].
-    """
-
-    T_world_start: Array
-    T_world_end: Array
-    duration: float
-    knots: Array
-    _timing: Trajectory
-
-    def s(self, time: float) -> float:
-        """The path parameter in [0, 1] at a time [s]."""
-        position, _, _ = self._timing.at_time(min(max(time, 0.0), self.duration))
-        return float(np.clip(position[0], 0.0, 1.0))
-
-    def T_world_tool(self, time: float) -> Array:
-        """The tool pose `(4, 4)` at a time [s]."""
-        if time >= self.duration:
-            return self.T_world_end.copy()
-        return interpolate(self.T_world_start, self.T_world_end, self.s(time))
-
-    def sample(self, hz: float) -> Array:
-        """Tool poses `(n, 4, 4)` at 1/hz, 2/hz, ... up to the end."""
-        n = max(1, round(self.duration * hz))
-        return np.stack([self.T_world_tool(self.duration * (i + 1) / n) for i in range(n)])
+# The number of knots is doubled until the tool's deviation is within bounds.
+_FEWEST, _MOST = 13, 200
 
 
 def straight_line(
@@ -57,83 +23,65 @@ def straight_line(
     T_world_end: Array,
     duration: float,
     max_joint_step: float = 0.35,
-) -> StraightLine:
-    """A straight tool line that takes `duration` seconds and keeps the joints within their limits.
+    deviation: float = 2e-5,
+) -> Motion:
+    """The motion of the tool in a straight line, in `duration` or as much longer as joints need.
 
-    The path parameter s rises from 0 to 1 with short jerk-limited ramps (cruise within 0.25 s:
-    slow starts and ends make poor training data). The joint path is the quintic spline q(s) through
-    inverse-kinematics solutions; its derivatives bound s', s'' and s''' so that the joints' limits
-    hold (shared/reference, section 5: |q'| s' <= v, |q'| s'' + |q''| s'^2 <= a,
-    |q'| s''' + 3 |q''| s' s'' + |q'''| s'^3 <= j).
+    The joint path is a quintic spline through inverse-kinematics solutions on the line, as many as
+    keep the tool within `deviation` of it between them. See `timed` for its course in time.
 
     Args:
         model: the robot.
         q_start: joint configuration `(n,)` at the start.
         T_world_start: tool pose there `(4, 4)`.
         T_world_end: tool pose at the end `(4, 4)`.
-        duration: seconds from rest to rest.
+        duration: seconds from rest to rest, if the limits allow.
         max_joint_step: greatest joint motion [rad] between neighbouring knots.
+        deviation: how far the tool may be from the line, [m] and [rad].
 
     Raises:
-        InvalidInput: not a pose, or duration not positive.
+        InvalidInput: not a pose, or duration or deviation not positive.
         Unreachable: some pose of the line is out of reach.
-        MotionRejected: a joint would jump, or the line can't be done in `duration`.
+        MotionRejected: a joint would jump, or leave its range, or the line bends too much.
     """
     start, end = check_pose("T_world_start", T_world_start), check_pose("T_world_end", T_world_end)
-    duration = check_positive("duration", duration, "s")
-    grid = np.linspace(0.0, 1.0, _KNOTS)
-    knots = np.empty((_KNOTS, len(q_start)))
-    knots[0] = model.ik(start, q_start, max_joint_step)
-    for i in range(1, _KNOTS):
+    check_positive("duration", duration, "s")
+    check_positive("deviation", deviation, "m")
+    T_at = functools.partial(interpolate, start, end)
+    count = _FEWEST
+    knots = _solutions(model, q_start, T_at, np.linspace(0.0, 1.0, count), max_joint_step)
+    while True:
+        path = SplinePath.through(knots)
+        middles = (np.arange(count - 1) + 0.5) / (count - 1)
+        between = path.positions(middles)
+        off = max(
+            max(distance(model.fk(q), T_at(s))) for q, s in zip(between, middles, strict=True)
+        )
+        if off <= deviation:
+            return timed(model, path, duration, T_at)
+        if 2 * count > _MOST:
+            raise MotionRejected(
+                f"joint path: {off * 1e3:.2f} mm off the line with {count} knots, a joint turns "
+                "too sharply; sample nearer"
+            )
+        # The solutions between the knots are found from where the spline is already.
+        new = np.array([
+            model.ik(T_at(s), q, max_joint_step) for q, s in zip(between, middles, strict=True)
+        ])  # fmt: skip
+        count = 2 * count - 1
+        merged = np.empty((count, knots.shape[1]))
+        merged[::2], merged[1::2] = knots, new
+        knots = merged
+
+
+def _solutions(
+    model: RobotModel, q_start: Array, T_at: functools.partial[Array], grid: Array, max_step: float
+) -> Array:
+    """Joint configurations `(m, n)` at path parameters `(m,)`, on the branch of `q_start`."""
+    knots = np.empty((len(grid), len(q_start)))
+    for i, s in enumerate(grid):
         # Extrapolating from the last two knots keeps the solver on its branch.
-        near = knots[i - 1] if i < 2 else 2 * knots[i - 1] - knots[i - 2]
-        near = np.clip(near, model.lower, model.upper)
-        knots[i] = model.ik(interpolate(start, end, grid[i]), near, max_joint_step)
-    limits = _path_limits(model, grid, knots, duration)
-    timing = _timed(limits)
-    if timing.duration > duration + 1e-6:
-        raise MotionRejected(
-            f"joint limits: the line needs {timing.duration:.2f} s, {duration:.2f} s were given; "
-            "allow more time or sample nearer"
-        )
-    return StraightLine(start, end, duration, knots, timing)
-
-
-def _path_limits(
-    model: RobotModel, grid: Array, knots: Array, duration: float
-) -> tuple[float, float, float]:
-    """Limits of s', s'', s''': those that just fill `duration`, or less where joints demand it."""
-    ramp = min(_RAMP, duration / 4)
-    v = 1.0 / (duration - ramp)
-    # A ramp of length r with constant-jerk ends of share e: a = v / (r (1 - e)), j = a / (r e).
-    a = v / (ramp * (1.0 - _JERK_SHARE))
-    j = a / (ramp * _JERK_SHARE)
-    spline = make_interp_spline(grid, knots, k=5)
-    fine = np.linspace(0.0, 1.0, 4 * _KNOTS)
-    d1, d2, d3 = (np.abs(spline.derivative(i)(fine)).max(0) for i in (1, 2, 3))
-    spec = model.spec
-    tiny = 1e-12
-    v = min(v, float((spec.velocity_limits / (d1 + tiny)).min()))
-    a = min(a, float(((spec.acceleration_limits - d2 * v**2) / (d1 + tiny)).min()))
-    if a <= 0:
-        raise MotionRejected(
-            "joint limits: the line bends too sharply at its speed; allow more time"
-        )
-    j = min(j, float(((spec.jerk_limits - 3 * d2 * v * a - d3 * v**3) / (d1 + tiny)).min()))
-    if j <= 0:
-        raise MotionRejected(
-            "joint limits: the line needs more jerk than they allow; allow more time"
-        )
-    return v, a, j
-
-
-def _timed(limits: tuple[float, float, float]) -> Trajectory:
-    request = InputParameter(1)
-    request.current_position, request.target_position = [0.0], [1.0]
-    v, a, j = limits
-    request.max_velocity, request.max_acceleration, request.max_jerk = [v], [a], [j]
-    trajectory = Trajectory(1)
-    result = Ruckig(1).calculate(request, trajectory)
-    if result != Result.Working and result != Result.Finished:
-        raise MotionRejected(f"joint limits: Ruckig found no timing ({result}); allow more time")
-    return trajectory
+        near = q_start if i == 0 else knots[i - 1] if i == 1 else 2 * knots[i - 1] - knots[i - 2]
+        near = near if i == 0 else np.clip(near, model.lower, model.upper)
+        knots[i] = model.ik(T_at(float(s)), near, max_step)
+    return knots

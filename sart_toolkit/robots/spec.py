@@ -13,6 +13,8 @@ import numpy as np
 from sart_toolkit.errors import InvalidInput, MissingExtra, MissingFile
 from sart_toolkit.poses import Array, check_array, check_pose, check_positive, frozen
 
+_SIDES = 16
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -42,15 +44,20 @@ class Shape:
         object.__setattr__(self, "T_body_shape", frozen(T))
 
     def corners(self) -> Array:
-        """Points `(n, 3)` in the body frame whose convex hull encloses the shape."""
-        if self.kind == "box":
-            half = np.array(self.size) / 2
-        elif self.kind == "cylinder":
-            half = np.array([self.size[0], self.size[0], self.size[1] / 2])
+        """Points `(n, 3)` in the body frame whose convex hull encloses the shape.
+
+        For a cylinder they are those of a prism with sixteen sides, for a sphere of a cube.
+        """
+        if self.kind == "cylinder":
+            angles = 2 * np.pi * np.arange(_SIDES) / _SIDES
+            r, half = self.size[0] / np.cos(np.pi / _SIDES), self.size[1] / 2
+            ring = np.stack([r * np.cos(angles), r * np.sin(angles), np.full(_SIDES, half)], 1)
+            points = np.concatenate([ring, ring * [1, 1, -1]])
         else:
-            half = np.full(3, self.size[0])
-        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-        return signs * half @ self.T_body_shape[:3, :3].T + self.T_body_shape[:3, 3]
+            half_edges = np.array(self.size) / 2 if self.kind == "box" else np.full(3, self.size[0])
+            signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+            points = signs * half_edges
+        return points @ self.T_body_shape[:3, :3].T + self.T_body_shape[:3, 3]
 
 
 def mass_properties(shapes: Sequence[Shape], mass: float) -> tuple[Array, Array]:

@@ -1,1 +1,1 @@
-"""What surrounds the robot (`SceneSpec`) and how far the robot is from it (`ClearanceModel`)."""
+"""What surrounds the robot, how far the robot is from it, and proofs that a path stays clear."""

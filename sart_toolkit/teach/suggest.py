@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.stats import qmc
 
-from sart_toolkit.errors import InvalidInput, Unreachable
-from sart_toolkit.poses import Array, check_positive, pose
+from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
+from sart_toolkit.poses import Array, check_positive, distance, pose
 from sart_toolkit.records import (
     ROTATION_PER_METRE,
     Annotation,
@@ -20,12 +21,20 @@ from sart_toolkit.records import (
     convergence_waypoint,
 )
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.scene.clearance import ClearanceModel
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scene.demonstrated import DemonstratedScene, Phase
 
 _BISECTIONS = 40
 _SHRINK = 0.9
+# A pose is within reach if no joint is nearer to its limit than this [rad], and the Jacobian's
+# smallest singular value (metres and radians alike) no less: elsewhere small motions of the tool
+# take large ones of the joints.
+_JOINT_MARGIN = 0.05
+_LEAST_SINGULAR_VALUE = 0.05
+_LARGEST_STEP = 1.5
+# What moves no farther than this in 0.2 s stands still [m, deg].
+_STILL, _STILL_DEG = 0.0005, 0.2
+# A sphere of this radius [m] or more is probed in full, the smallest at a quarter of the poses.
+_WIDE, _FEWEST_PROBES = 0.06, 0.25
 
 
 @dataclass(frozen=True)
@@ -34,14 +43,14 @@ class SuggestConfig:
 
     `margin` [m] stays free everywhere; no radius is below `min_radius` or above `max_radius` [m];
     `rotation_per_metre` [rad/m] is the augmentation's nu_r; `probes` is the number of poses at
-    which reach and the arm's own clearance are tried.
+    which the whole robot is tried in a wide sphere.
     """
 
-    margin: float = 0.002
+    margin: float = 0.0005
     min_radius: float = 0.004
     max_radius: float = 0.15
     rotation_per_metre: float = ROTATION_PER_METRE
-    probes: int = 64
+    probes: int = 24
 
     def __post_init__(self) -> None:
         for name in ("margin", "min_radius", "max_radius"):
@@ -62,7 +71,9 @@ class SuggestConfig:
 class Suggestion:
     """A suggested radius [m] (0: no room), the clearance behind it, and what limits it.
 
-    `clearance` [m] is `None` where it was not needed: the demonstration's phase leaves no room.
+    `clearance` [m] is that of the pair of bodies that bounds the radius, or of the nearest pair
+    where something else does; `None` where it was not needed: the demonstration's phase leaves no
+    room.
     """
 
     radius: float
@@ -70,76 +81,211 @@ class Suggestion:
     limited_by: str
 
 
-def certified_radius(
-    clearance: float, reach: float, margin: float, rotation_per_metre: float, largest: float
-) -> float:
-    """The largest r [m] for which a body stays clear at every pose drawn within r.
+@dataclass(frozen=True)
+class Gap:
+    """A convex part of the tool and a convex obstacle, their names and distance [m].
 
-    A pose within r and angle nu r of the waypoint moves no point of a body whose farthest point is
-    rho from the tool centre by more than r + 2 rho sin(min(nu r, pi) / 2); the body is clear if
-    that plus the margin is at most its clearance (shared/reference, section 4).
+    `normal (3,)`: the unit vector from the obstacle's nearest point to the part's, world frame.
+    `points (n, 3)`: points whose hull encloses the part, from the tool frame's origin, world axes;
+    `support`: how far [m] the obstacle reaches along the normal, from the same origin.
+    """
+
+    part: str
+    obstacle: str
+    distance: float
+    normal: Array
+    points: Array
+    support: float
+
+    def fits(self, radius: float, margin: float, rotation_per_metre: float) -> bool:
+        """Whether the part keeps `margin` [m] at every pose within `radius` and nu radius.
+
+        One of two proofs is enough. No point moves farther than r + 2 rho sin(nu r / 2), rho being
+        the farthest point's distance from the tool's origin (shared/reference, section 4). And the
+        plane across the gap still separates the two if no point x, turned towards it by up to nu r
+        and moved by up to r, comes nearer than the margin:
+        |x| cos(alpha + nu r) - r >= support + margin, alpha being the angle from x to the normal.
+        """
+        return self._distance_fits(radius, margin, rotation_per_metre) or self._plane_fits(
+            radius, margin, rotation_per_metre
+        )
+
+    def limited(self, best: Suggestion, config: SuggestConfig) -> Suggestion:
+        """`best`, or less where this gap allows only that."""
+        if self.fits(best.radius, config.margin, config.rotation_per_metre):
+            return best
+        r = certified_radius(self, config.margin, config.rotation_per_metre, best.radius)
+        return Suggestion(r, self.distance, f"{self.part} / {self.obstacle}")
+
+    def _distance_fits(self, radius: float, margin: float, nu: float) -> bool:
+        swing = 2 * self._reach * np.sin(min(nu * radius, np.pi) / 2)
+        return bool(radius + swing + margin <= self.distance)
+
+    def _plane_fits(self, radius: float, margin: float, nu: float) -> bool:
+        lengths, angles = self._polar
+        lowest = lengths * np.cos(np.minimum(angles + nu * radius, np.pi))
+        return bool(lowest.min() - radius >= self.support + margin)
+
+    @functools.cached_property
+    def _reach(self) -> float:
+        return float(np.linalg.norm(self.points, axis=1).max())
+
+    @functools.cached_property
+    def _polar(self) -> tuple[Array, Array]:
+        """Each point's distance from the tool's origin [m] and angle [rad] from the normal."""
+        along = self.points @ self.normal
+        lengths = np.linalg.norm(self.points, axis=1)
+        across = np.sqrt(np.maximum(lengths**2 - along**2, 0.0))
+        return lengths, np.arctan2(across, along)
+
+
+def certified_radius(gap: Gap, margin: float, rotation_per_metre: float, largest: float) -> float:
+    """The largest r [m] for which a tool part is proved clear at every pose drawn within r.
 
     Args:
-        clearance: distance d [m] of the body to the scene at the waypoint.
-        reach: rho [m].
+        gap: part and obstacle at the waypoint.
         margin: distance [m] that stays free.
         rotation_per_metre: nu [rad/m].
         largest: upper bound [m] of the answer.
     """
-
-    def fits(r: float) -> bool:
-        swing = 2 * reach * np.sin(min(rotation_per_metre * r, np.pi) / 2)
-        return bool(r + swing + margin <= clearance)
-
-    if not fits(0.0):
+    if not gap.fits(0.0, margin, rotation_per_metre):
         return 0.0
-    if fits(largest):
+    if gap.fits(largest, margin, rotation_per_metre):
         return largest
     low, high = 0.0, largest
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if fits(middle) else (low, middle)
+        if gap.fits(middle, margin, rotation_per_metre):
+            low = middle
+        else:
+            high = middle
     return low
 
 
-def suggest_radius(
-    clearances: ClearanceModel,
-    q: Array,
-    T_world_key: Array,
-    Ts_world_body: Mapping[str, Array],
-    config: SuggestConfig,
-    carried: Collection[str] = (),
-) -> Suggestion:
-    """The largest radius around one waypoint that keeps the robot clear.
+class Surroundings(Protocol):
+    """What radii are suggested from: where obstacles are at each waypoint, however it is known.
 
-    Tool bodies are proved clear of the scene for every pose that can be drawn. Reach, and the arm's
-    clearance from the scene and from the tool, are tried at `probes` extreme poses and the radius
-    shrunk until all pass; the executed motion is checked later in any case.
+    Attributes:
+        kinematics: the robot.
+        phases: the phase of each waypoint.
+    """
+
+    kinematics: RobotModel
+    phases: tuple[Phase, ...]
+
+    def proved(self, t: int, config: SuggestConfig) -> Suggestion:
+        """The largest radius about waypoint `t` for which the tool is proved clear of obstacles."""
+
+    def too_close(self, t: int, q: Array, margin: float) -> str | None:
+        """The names of a pair of the whole robot, the scene as at `t`, nearer than the margin."""
+
+    def moving(self, t: int) -> str | None:
+        """The name of an obstacle that doesn't stand still at waypoint `t`."""
+
+
+class ExactSurroundings:
+    """Obstacles as the simulated scene has them."""
+
+    def __init__(self, scene: DemonstratedScene) -> None:
+        """Take the scene's bodies from where the demonstration has them."""
+        self._scene = scene
+        self.kinematics = scene.collision.kinematics
+        self.phases = scene.phases
+
+    def gaps(self, t: int) -> Iterator[Gap]:
+        """Tool parts and obstacles at waypoint `t`, nearest first."""
+        placed = self._scene.placed(t)
+        q = self._scene.demonstration.steps.joint_positions[t]
+        pairs = placed.tool_pairs()
+        distances = np.array(placed.pair_distances(q, pairs))
+        T_joint = placed.joint_poses(q)[-1]
+        p_tool = (T_joint @ placed.T_joint_tool)[:3, 3]
+        for i in np.argsort(distances, kind="stable"):
+            found = placed.witness(q, pairs[i])
+            part = placed.parts[placed.pairs[pairs[i]][0]]
+            normal = found.p_a - found.p_b
+            length = float(np.linalg.norm(normal))
+            # Bodies that touch have no plane between them; nothing fits then.
+            normal = normal / length if length > 1e-9 else np.zeros(3)
+            points = part.points @ T_joint[:3, :3].T + T_joint[:3, 3] - p_tool
+            support = float(normal @ (found.p_b - p_tool))
+            yield Gap(found.a, found.b, found.distance, normal, points, support)
+
+    def proved(self, t: int, config: SuggestConfig) -> Suggestion:
+        """The largest radius about waypoint `t` for which the tool is proved clear of obstacles."""
+        placed, nu = self._scene.placed(t), config.rotation_per_metre
+        last = len(self.kinematics.spec.arm_joints)
+        tool = [part.points for part in placed.parts if part.joint == last]
+        p_tool = placed.T_joint_tool[:3, 3]
+        reach = float(np.linalg.norm(np.concatenate(tool) - p_tool, axis=1).max())
+        best = Suggestion(config.max_radius, None, "max_radius")
+        for gap in self.gaps(t):
+            if best.clearance is None:
+                best = dataclasses.replace(best, clearance=gap.distance)
+            # No point of the tool comes as far as the pairs from here on.
+            swept = best.radius + 2 * reach * np.sin(min(nu * best.radius, np.pi) / 2)
+            if gap.distance >= swept + config.margin:
+                break
+            best = gap.limited(best, config)
+        return best
+
+    def too_close(self, t: int, q: Array, margin: float) -> str | None:
+        """The names of a pair of the whole robot, the scene as at `t`, nearer than the margin."""
+        pair = self._scene.placed(t).too_close(q, margin)
+        return None if pair is None else " / ".join(pair)
+
+    def moving(self, t: int) -> str | None:
+        """The name of a body that doesn't stand still at waypoint `t`; a carried one may move."""
+        bodies = self._scene.demonstration.body_Ts_world
+        before, after = max(t - 1, 0), min(t + 1, len(self.phases) - 1)
+        for name, Ts in bodies.items():
+            if name in self.phases[t].carried or name in self._held:
+                continue
+            far, turn = distance(Ts[before], Ts[after])
+            if far > _STILL or turn > np.deg2rad(_STILL_DEG):
+                return name
+        return None
+
+    @functools.cached_property
+    def _held(self) -> frozenset[str]:
+        return frozenset(body.name for body in self._scene.collision.scene.held)
+
+
+def suggest_radius(
+    surroundings: Surroundings,
+    demonstration: Demonstration,
+    t: int,
+    config: SuggestConfig | None = None,
+) -> Suggestion:
+    """The largest radius around waypoint `t` that keeps the robot clear.
+
+    Tool bodies are proved clear of the scene for every pose that can be drawn. The whole robot, its
+    reach, and the waypoint that a segment of this radius starts from are tried, the robot at
+    `probes` extreme poses, and the radius shrunk until all pass.
 
     Args:
-        clearances: robot and scene.
-        q: joint configuration `(n,)` at the waypoint.
-        T_world_key: tool pose `(4, 4)` there.
-        Ts_world_body: where the scene's bodies were.
+        surroundings: where the obstacles are.
+        demonstration: what was shown.
+        t: the key waypoint.
         config: margins and limits.
-        carried: names of bodies in the gripper's grasp.
+
+    Raises:
+        InvalidInput: no such waypoint.
     """
-    bodies = clearances.tool_clearances(q, Ts_world_body, carried)
-    nearest = min(body.nearest.distance for body in bodies)
-    best = Suggestion(config.max_radius, nearest, "max_radius")
-    for body in bodies:
-        pair = body.nearest
-        r = certified_radius(
-            pair.distance,
-            body.reach,
-            config.margin,
-            config.rotation_per_metre,
-            config.max_radius,
-        )
-        if r < best.radius:
-            best = Suggestion(r, pair.distance, f"{pair.a} / {pair.b}")
+    config = config or SuggestConfig()
+    if not 0 <= t < len(demonstration) - 1:
+        raise InvalidInput(f"waypoint {t}: expected 0 to {len(demonstration) - 2}; choose another")
+    room = _room_before_event(demonstration, surroundings.phases, t)
+    if room is not None and room.radius < config.min_radius:
+        return room
+    moving = surroundings.moving(t)
+    if moving is not None:
+        return Suggestion(0.0, None, f"{moving} moves")
+    best = surroundings.proved(t, config)
+    if room is not None and room.radius < best.radius:
+        best = dataclasses.replace(room, clearance=best.clearance)
     while best.radius >= config.min_radius:
-        problem = _probe(clearances, q, T_world_key, Ts_world_body, best.radius, config, carried)
+        problem = _probe(surroundings, demonstration, t, best.radius, config)
         if problem is None:
             return best
         best = Suggestion(best.radius * _SHRINK, best.clearance, problem)
@@ -147,30 +293,48 @@ def suggest_radius(
 
 
 def _probe(
-    clearances: ClearanceModel,
-    q: Array,
-    T_world_key: Array,
-    Ts_world_body: Mapping[str, Array],
+    surroundings: Surroundings,
+    demonstration: Demonstration,
+    t: int,
     radius: float,
     config: SuggestConfig,
-    carried: Collection[str],
 ) -> str | None:
-    """What goes wrong at one of the extreme poses of a radius, or None."""
-    # Halton points of the four-dimensional square: direction of the offset, axis of the turn.
-    points = qmc.Halton(4, scramble=False).random(config.probes)
-    directions, axes = _sphere_points(points[:, :2]), _sphere_points(points[:, 2:])
+    """What goes wrong at one of the extreme poses of a radius, or at its t*; or None."""
+    steps, model = demonstration.steps, surroundings.kinematics
+    T_key, q_key = steps.measured_Ts_world_tool[t], steps.joint_positions[t]
+    t_star = convergence_waypoint(demonstration, PrecisionSphere(t, T_key, radius))
+    moving = surroundings.moving(t_star)
+    if moving is not None:
+        return f"{moving} moves at waypoint {t_star}"
+    pair = surroundings.too_close(t_star, steps.commanded_joint_positions[t_star], config.margin)
+    if pair is not None:
+        return f"{pair} at waypoint {t_star}"
     angle = config.rotation_per_metre * radius
-    for direction, axis in zip(directions, axes, strict=True):
-        T = T_world_key @ pose(rotvec=angle * axis)
-        T[:3, 3] = T_world_key[:3, 3] + radius * direction
+    # The arm hardly moves in a small sphere.
+    count = int(np.ceil(config.probes * min(1.0, max(radius / _WIDE, _FEWEST_PROBES))))
+    for direction, axis in _directions(count):
+        T = T_key @ pose(rotvec=angle * axis)
+        T[:3, 3] = T_key[:3, 3] + radius * direction
         try:
-            q_probe = clearances.model.ik(T, q)
-        except Unreachable:
+            q = model.ik(T, q_key, _LARGEST_STEP)
+        except (Unreachable, MotionRejected):
             return "reach"
-        pair = clearances.arm_distance(q_probe, Ts_world_body, carried)
-        if pair.distance < config.margin:
-            return f"{pair.a} / {pair.b}"
+        if min((q - model.lower).min(), (model.upper - q).min()) < _JOINT_MARGIN:
+            return "joint limit"
+        if np.linalg.svd(model.jacobian(q), compute_uv=False)[-1] < _LEAST_SINGULAR_VALUE:
+            return "singularity"
+        pair = surroundings.too_close(t, q, config.margin)
+        if pair is not None:
+            return pair
     return None
+
+
+@functools.cache
+def _directions(count: int) -> list[tuple[Array, Array]]:
+    """Pairs of unit vectors `(3,)` spread evenly: direction of the offset, axis of the turn."""
+    # Halton points of the four-dimensional square.
+    points = qmc.Halton(4, scramble=False).random(count)
+    return list(zip(_sphere_points(points[:, :2]), _sphere_points(points[:, 2:]), strict=True))
 
 
 def _sphere_points(uv: Array) -> Array:
@@ -180,36 +344,8 @@ def _sphere_points(uv: Array) -> Array:
     return np.stack([flat * np.cos(psi), flat * np.sin(psi), z], axis=1)
 
 
-@dataclass(frozen=True)
-class _Phase:
-    """What a waypoint has in common with its neighbours until the gripper or a contact changes."""
-
-    gripper: float
-    carried: frozenset[str]
-    contacts: frozenset[tuple[str, str]]
-
-    def change(self, after: _Phase) -> str:
-        """What is other in the phase after this one."""
-        if self.gripper != after.gripper:
-            return "gripper command"
-        if self.carried != after.carried:
-            return "grasp of " + ", ".join(sorted(self.carried ^ after.carried))
-        return "contact " + " / ".join(min(self.contacts ^ after.contacts))
-
-
-def _phases(demonstration: Demonstration, robot: RobotSpec, scene: SceneSpec) -> list[_Phase]:
-    commands = demonstration.steps.commanded_gripper
-    phases = []
-    for command, touching in zip(commands, demonstration.touching, strict=True):
-        carried = scene.grasped(touching, robot.gripper.finger_links)
-        contacts = scene.outer_contacts(touching, carried)
-        phases.append(_Phase(round(float(command), 2), carried, contacts))
-    # Before the first step nothing has been felt yet.
-    return [dataclasses.replace(phases[1], gripper=phases[0].gripper), *phases[1:]]
-
-
 def _room_before_event(
-    demonstration: Demonstration, phases: Sequence[_Phase], t: int
+    demonstration: Demonstration, phases: Sequence[Phase], t: int
 ) -> Suggestion | None:
     """The largest radius that the demonstration leaves before its phase ends; None if it doesn't.
 
@@ -229,13 +365,12 @@ def _room_before_event(
 
 def suggest_annotation(
     demonstration: Demonstration,
-    robot: RobotSpec,
-    scene: SceneSpec,
+    surroundings: Surroundings,
     waypoints: Sequence[int] | None = None,
     config: SuggestConfig | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Annotation:
-    """Precision spheres for a demonstration, their radii from the scene.
+    """Precision spheres for a demonstration, their radii from its surroundings.
 
     Without `waypoints`, spheres tile the free part: the first at the start, each next one at the
     convergence waypoint of the one before, or at the first later waypoint with room for
@@ -243,9 +378,8 @@ def suggest_annotation(
     grasp, release or contact; an object in the grasp counts as part of the tool.
 
     Args:
-        demonstration: what was shown; it must hold the poses of the scene's bodies.
-        robot: the robot that was steered.
-        scene: the task's scene.
+        demonstration: what was shown.
+        surroundings: where the obstacles were.
         waypoints: key waypoints, or `None` to choose them.
         config: margins and limits.
         progress: called with the waypoint reached.
@@ -254,43 +388,28 @@ def suggest_annotation(
         InvalidInput: a waypoint is out of range or has no room, or no waypoint has room.
     """
     config = config or SuggestConfig()
-
-    @functools.cache
-    def clearances(gripper: float) -> ClearanceModel:
-        return ClearanceModel(RobotModel(robot, scene.held, gripper), scene)
-
-    steps = demonstration.steps
     last = len(demonstration) - 1
-    phases = _phases(demonstration, robot, scene)
 
     def sphere_at(t: int) -> tuple[Suggestion, PrecisionSphere | None]:
-        T_key = steps.measured_Ts_world_tool[t]
-        room = _room_before_event(demonstration, phases, t)
-        if room is not None and room.radius < config.min_radius:
-            found = room
-        else:
-            bodies = {name: Ts[t] for name, Ts in demonstration.body_Ts_world.items()}
-            opening = clearances(round(float(steps.measured_gripper[t]), 2))
-            found = suggest_radius(
-                opening, steps.joint_positions[t], T_key, bodies, config, phases[t].carried
-            )
-            if room is not None and room.radius < found.radius:
-                found = dataclasses.replace(room, clearance=found.clearance)
+        found = suggest_radius(surroundings, demonstration, t, config)
         if progress is not None:
             progress(t)
-        if found.radius < config.min_radius or found.clearance is None:
+        if found.radius < config.min_radius:
             return found, None
         # Whole micrometres, rounded down: coal's last digits depend on what it computed before.
-        radius, clearance = (np.floor(x * 1e6) / 1e6 for x in (found.radius, found.clearance))
+        radius, clearance = (
+            None if x is None else float(np.floor(x * 1e6) / 1e6)
+            for x in (found.radius, found.clearance)
+        )
+        assert radius is not None
+        T_key = demonstration.steps.measured_Ts_world_tool[t]
         return found, PrecisionSphere(
-            t, T_key, float(radius), "ball", "suggested", float(clearance), found.limited_by
+            t, T_key, radius, "ball", "suggested", clearance, found.limited_by
         )
 
     spheres = []
     if waypoints is not None:
         for t in sorted(set(waypoints)):
-            if not 0 <= t < last:
-                raise InvalidInput(f"waypoint {t}: expected 0 to {last - 1}; choose another")
             found, sphere = sphere_at(t)
             if sphere is None:
                 reason = found.limited_by

@@ -22,7 +22,7 @@ from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.robots import ROBOTS
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.scene.clearance import coal_transform, convex_distance, robot_parts
+from sart_toolkit.scene.collision import coal_transform, convex_distance, robot_parts
 from sart_toolkit.scene.spec import SceneSpec, SceneState
 from sart_toolkit.tables import lookup
 from sart_toolkit.testing.scenes import BLOCK_TOP, SCENES, STICK_TIP, ready_joints, site
@@ -267,11 +267,11 @@ def _finger_parts(robot_name: str) -> list[_Part]:
     T_tool_world = inverse(model.fk(robot.home))
     found = []
     for part in robot_parts(model):
-        if part.link in robot.gripper.finger_links:
-            frame = model.pinocchio_model.frames[model.pinocchio_model.getFrameId(part.link)]
+        if part.body in robot.gripper.finger_links:
+            frame = model.pinocchio_model.frames[model.pinocchio_model.getFrameId(part.body)]
             T_link_part = inverse(np.array(frame.placement.homogeneous)) @ part.T_joint_part
-            T_tool_part = T_tool_world @ model.fk(robot.home, part.link) @ T_link_part
-            found.append((part.link, part.geometry, T_link_part, int(T_tool_part[0, 3] > 0)))
+            T_tool_part = T_tool_world @ model.fk(robot.home, part.body) @ T_link_part
+            found.append((part.body, part.geometry, T_link_part, int(T_tool_part[0, 3] > 0)))
     return found
 
 

@@ -7,8 +7,7 @@ import pytest
 
 from sart_toolkit.backends.interface import Contact
 from sart_toolkit.poses import pose
-from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.clearance import ClearanceModel
+from sart_toolkit.scene.collision import CollisionModel
 from sart_toolkit.testing.bench import Bench
 from sart_toolkit.testing.scenes import BRICK_HEIGHT, PUSH_HEIGHT
 
@@ -89,24 +88,31 @@ def test_contacts_agree_with_the_geometry(touch: Bench) -> None:
     touch.relies_on(
         not _moving(touch, touch.backend.contacts()), "test_nothing_touches_in_free_space"
     )
-    model = RobotModel(touch.model.spec, touch.scene.held, touch.gripper)
-    clearances = ClearanceModel(model, touch.scene)
-    bodies = touch.state().Ts_world_body
+    model, n = touch.model, len(touch.ready)
+    placed = CollisionModel(model.spec, touch.scene).placed(
+        touch.state().Ts_world_body, touch.gripper
+    )
+    # Of the robot itself, a backend need only see the tool touch the arm, the wrist left out.
+    joints = [[placed.parts[i].joint for i in pair] for pair in placed.pairs]
+    bodies = {body.name for body in touch.scene.bodies}
+    seen = [
+        k
+        for k, (a, b) in enumerate(joints)
+        if placed.names(k)[1] in bodies or (a == n and b <= n - 3)
+    ]
     rng = np.random.default_rng(0)
     kinds = set()
     for _ in range(24):
         q = touch.ready + rng.uniform(-1.2, 1.2, len(touch.ready))
         if ((q < model.lower) | (q > model.upper)).any():
             continue
-        arm = clearances.arm_distance(q, bodies)
-        pairs = [arm, *(tool.nearest for tool in clearances.tool_clearances(q, bodies))]
-        nearest = min(pairs, key=lambda pair: pair.distance)
-        if abs(nearest.distance) < 0.008:
+        nearest = min(placed.pair_distances(q, seen))
+        if abs(nearest) < 0.008:
             continue
         touch.reset(q)
         touch.command(q)
         touched = _moving(touch, touch.backend.contacts())
-        assert bool(touched) == (nearest.distance < 0), (nearest, touched)
+        assert bool(touched) == (nearest < 0), (nearest, touched)
         kinds.add(bool(touched))
     assert kinds == {False, True}
 

@@ -47,6 +47,32 @@ def test_joint_velocities_are_those_of_the_joints(bench: Bench) -> None:
     np.testing.assert_allclose(seen.dq, (seen.q - before) * CONTROL_HZ, rtol=0.02, atol=0.01)
 
 
+def test_the_joint_path_leads_from_one_observation_to_the_next(bench: Bench) -> None:
+    """Evenly, oldest first, to the joints as they are; none after a restore or reset.
+
+    A backend may give no rows at all.
+    """
+    speed = np.linspace(0.2, 0.8, len(bench.ready))
+    for i in range(1, 16):
+        before = bench.see().q
+        bench.command(bench.ready + speed * i / CONTROL_HZ)
+    seen = bench.see()
+    path, n = seen.joint_path, len(seen.q)
+    assert path.ndim == 2 and path.shape[1] == n
+    if len(path) > 0:
+        np.testing.assert_array_equal(path[-1], seen.q)
+        way = seen.q - before
+        even = before + np.linspace(0, 1, len(path) + 1)[1:, None] * way
+        # The backend's own clock may be off the control period by one row.
+        assert (np.abs(path - even) <= np.abs(way) / len(path) + 1e-3).all()
+    if bench.has("can_restore"):
+        bench.backend.restore(bench.backend.save())
+        assert bench.see().joint_path.shape == (0, n)
+    bench.command(bench.ready)
+    bench.reset()
+    assert bench.see().joint_path.shape == (0, n)
+
+
 def test_joints_stay_within_their_limits(bench: Bench) -> None:
     """A target at the limit is not overshot."""
     for limit, sign in ((bench.model.upper[-1], -1), (bench.model.lower[-1], 1)):

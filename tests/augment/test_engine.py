@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from sart_toolkit.augment import engine
-from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration, try_segment
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
+from sart_toolkit.augment.segments import KEPT, Attempt, SegmentMaker, SegmentPlanner
 from sart_toolkit.augment.strategies import STRATEGIES
-from sart_toolkit.backends.interface import Backend, Capabilities
+from sart_toolkit.backends.interface import Backend, Capabilities, Contact
 from sart_toolkit.errors import (
     CannotWrite,
     InvalidInput,
@@ -24,8 +26,7 @@ from sart_toolkit.errors import (
     SartError,
     UnknownName,
 )
-from sart_toolkit.motion.controller import ToolController
-from sart_toolkit.poses import interpolate, log_rotation
+from sart_toolkit.poses import interpolate, log_rotation, pose
 from sart_toolkit.records import apply_action, convergence_waypoint
 from sart_toolkit.storage import load_dataset
 
@@ -152,21 +153,25 @@ def test_the_measured_tool_follows_the_commands_and_the_join_is_smooth(strategy_
 
 
 def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_the_bit(
-    strategy_dataset, peg_backend, peg_model
+    strategy_dataset, peg_backend, peg_annotation
 ):
     demonstration = strategy_dataset.demonstration
+    planner = SegmentPlanner(
+        peg_backend.robot,
+        peg_backend.scene,
+        demonstration,
+        peg_annotation,
+        AugmentConfig(strategy=strategy_dataset.info["config"]["strategy"]),
+    )
     for episode in strategy_dataset.episodes[:4]:
         t = episode.provenance.t_star
         peg_backend.restore(demonstration.states[t])
-        controller = ToolController(peg_model)
-        controller.reset(
-            demonstration.steps.commanded_joint_positions[t],
-            demonstration.steps.commanded_Ts_world_tool[t],
-        )
         steps = episode.steps
+        proposal, rng = planner.proposal(episode.provenance.sphere, episode.provenance.k)
+        motion, _ = planner.plan(proposal, rng)
+        outwards = motion.joints(motion.times(30))
         for i in reversed(range(len(steps))):
-            now = peg_backend.observe().T_world_tool
-            for q in controller.move(steps.commanded_Ts_world_tool[i], now, 3):
+            for q in outwards[3 * (len(steps) - 1 - i) :][:3]:
                 peg_backend.command(q, steps.commanded_gripper[i])
                 peg_backend.step()
                 assert peg_backend.contacts() == []
@@ -179,14 +184,12 @@ def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_
 
 
 def test_a_try_depends_on_seed_sphere_and_number_alone(
-    peg_demonstration, peg_annotation, peg_backend, peg_model, peg_dataset
+    peg_demonstration, peg_annotation, peg_backend, peg_dataset
 ):
-    config = AugmentConfig(n=5)
+    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig(n=5))
     for episode in reversed(peg_dataset.episodes):
         p = episode.provenance
-        again = try_segment(
-            peg_backend, peg_model, peg_demonstration, peg_annotation, config, p.sphere, p.k
-        )
+        again = make(p.sphere, p.k)
         assert again.outcome == "kept"
         assert again.episode.content_hash() == episode.content_hash()
 
@@ -203,10 +206,14 @@ def test_quotas_go_round_robin_over_the_spheres(peg_annotation, augment, tmp_pat
     assert dataset.info["n_trajectories"] == n
 
 
-def test_tries_that_touch_are_rejected_and_counted_by_what_touched(crowded_dataset):
+def test_tries_that_would_touch_are_rejected_and_counted_by_what_touched(crowded_dataset):
     info = crowded_dataset.info
     assert len(crowded_dataset.episodes) == info["n_kept"] == 4
-    assert info["rejections"]["contact block / peg"] > 0
+    assert info["rejections"]["path too close peg / block"] > 0
+    for i, row in enumerate(info["spheres"]):
+        assert row["kept"] == sum(e.provenance.sphere == i for e in crowded_dataset.episodes)
+    total = sum((Counter(row["rejections"]) for row in info["spheres"]), Counter())
+    assert total == info["rejections"]
     assert all(isinstance(count, int) for count in info["rejections"].values())
     assert info["n_attempted"] == info["n_kept"] + sum(info["rejections"].values())
     assert info["simulated_seconds"] == pytest.approx(0.8 * info["n_attempted"])
@@ -237,25 +244,99 @@ def test_when_every_try_is_rejected_the_error_counts_the_reasons(annotate, augme
         calls.calls.clear()
 
 
-def test_a_line_too_fast_for_the_joints_is_one_reason_whatever_time_it_needs(
+def test_a_line_too_fast_for_the_joints_takes_longer_and_the_episode_says_so(
     annotate, augment, tmp_path
 ):
-    config = AugmentConfig(n=2, duration=0.1)
-    with pytest.raises(InvalidInput, match=r"none of 20 tries was kept \(joint limits: 20\)"):
-        augment(annotate((0, 0.1)), tmp_path / "d", config)
+    dataset = augment(annotate((0, 0.02)), tmp_path / "d", AugmentConfig(n=3, duration=0.1))
+    for episode in dataset.episodes:
+        duration = episode.provenance.certificate["duration"]
+        assert 0.1 < duration < 1.0
+        assert len(episode) == round(10 * duration)
+
+
+def test_what_touches_in_spite_of_the_proof_ends_the_segment_at_once(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+):
+    steps = []
+    step = peg_backend.step
+    monkeypatch.setattr(peg_backend, "step", lambda: (steps.append(1), step()))
+    bump = [Contact("block", "peg", 1.0, 0.0)]
+    monkeypatch.setattr(peg_backend, "contacts", lambda: bump if len(steps) == 7 else [])
+    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
+    assert make(0, 0) == Attempt("contact block / peg", None)
+    assert len(steps) == 7
+
+
+def test_a_backend_that_reports_no_contacts_can_augment(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+):
+    blind = dataclasses.replace(peg_backend.capabilities, has_contacts=False)
+    monkeypatch.setattr(peg_backend, "capabilities", blind)
+    monkeypatch.setattr(peg_backend, "contacts", None)
+    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
+    assert make(0, 0).outcome == KEPT
+
+
+def test_a_segment_on_which_something_else_is_moved_is_rejected(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+):
+    observe, seen = peg_backend.observe, []
+
+    def disturbed(*args):
+        found = observe(*args)
+        seen.append(found)
+        at = pose([0.002 if len(seen) > 30 else 0.0, 0, 0])
+        return dataclasses.replace(found, Ts_world_body={**found.Ts_world_body, "block": at})
+
+    monkeypatch.setattr(peg_backend, "observe", disturbed)
+    bodies = [
+        dataclasses.replace(body, mass=1.0) if body.name == "block" else body
+        for body in peg_backend.scene.bodies
+    ]
+    scene = dataclasses.replace(peg_backend.scene, bodies=tuple(bodies))
+    monkeypatch.setattr(peg_backend, "scene", scene)
+    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
+    assert make(0, 0).outcome == "block was moved"
+
+
+def test_a_measured_path_that_is_not_clear_rejects_the_segment(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+):
+    observe = peg_backend.observe
+    folded = np.array([0.0, 0.3, 2.6, 0.0, 0.0, 0.0])
+
+    def astray(*args):
+        found = observe(*args)
+        return dataclasses.replace(found, joint_path=np.stack([found.q, folded, found.q]))
+
+    monkeypatch.setattr(peg_backend, "observe", astray)
+    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
+    assert make(0, 0).outcome.startswith("left its path")
+
+
+def test_an_episode_s_certificates_say_what_is_proved(peg_dataset):
+    for episode in peg_dataset.episodes:
+        proof = episode.provenance.certificate
+        assert proof["duration"] == 2.0
+        assert proof["commanded"]["verdict"] == proof["measured"]["verdict"] == "free"
+        assert proof["commanded"]["clearance"] >= proof["commanded"]["margin"] == AugmentConfig().margin
+        assert 0 <= proof["deviation"] < 0.002
+        assert len(episode.joint_path) == 1 + 2 * 240
+
+
+def test_without_body_poses_nothing_can_be_proved(peg_demonstration, peg_annotation, peg_backend):
+    blind = dataclasses.replace(peg_demonstration, body_Ts_world={})
+    with pytest.raises(Mismatch, match="doesn't tell where 'table' was, .* observes bodies"):
+        SegmentMaker(peg_backend, blind, peg_annotation, AugmentConfig())
 
 
 def test_a_line_faster_than_the_tool_may_lead_is_rejected(
     annotate, peg_demonstration, peg_backend, peg_model
 ):
-    config = AugmentConfig(duration=0.5)
-    outcomes = {
-        try_segment(
-            peg_backend, peg_model, peg_demonstration, annotate((0, 0.1)), config, 0, k
-        ).outcome
-        for k in range(12)
-    }
-    assert "tool lags behind the line" in outcomes
+    make = SegmentMaker(
+        peg_backend, peg_demonstration, annotate((0, 0.1)), AugmentConfig(duration=0.5)
+    )
+    assert "tool lags behind" in {make(0, k).outcome for k in range(12)}
 
 
 def test_progress_counts_kept_and_rejected_tries(augment, crowded, crowded_dataset, tmp_path):
@@ -369,7 +450,9 @@ import sys
 import numpy as np
 from pathlib import Path
 from sart_toolkit.augment import engine
-from sart_toolkit.augment.engine import AugmentConfig, augment_demonstration
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
+from sart_toolkit.augment.segments import KEPT, Attempt, SegmentMaker, SegmentPlanner
 from sart_toolkit.backends import make_backend
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
@@ -377,7 +460,8 @@ from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import suggest_annotation
+from sart_toolkit.scene.demonstrated import DemonstratedScene
+from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 task = get_task("peg_in_hole")
 robot = get_robot(task.robot)
@@ -387,7 +471,8 @@ operator = ScriptedOperator(
     task.plan(task.initial_state(model, Placement())), np.random.default_rng(0)
 )
 demonstration = record_demonstration(make(), task, model, operator, seed=0)
-annotation = suggest_annotation(demonstration, robot, task.scene)
+scene = DemonstratedScene(demonstration, robot, task.scene)
+annotation = suggest_annotation(demonstration, ExactSurroundings(scene))
 config = AugmentConfig(n=5)
 dataset = augment_demonstration(demonstration, annotation, make, Path(sys.argv[1]), config)
 print()
@@ -520,7 +605,7 @@ def test_a_backend_that_lacks_a_capability_is_refused_and_closed(
     def make():
         return Arm(peg_backend.robot, peg_backend.scene)
 
-    with pytest.raises(MissingCapability, match="backend 'arm' can't restore states, report"):
+    with pytest.raises(MissingCapability, match="backend 'arm' can't restore states and render"):
         augment_demonstration(
             peg_demonstration, peg_annotation, make, tmp_path / "d", workers=workers
         )
@@ -528,11 +613,11 @@ def test_a_backend_that_lacks_a_capability_is_refused_and_closed(
 
 
 def test_a_try_on_a_backend_that_cannot_restore_is_refused(
-    peg_demonstration, peg_annotation, peg_backend, peg_model
+    peg_demonstration, peg_annotation, peg_backend
 ):
     arm = Arm(peg_backend.robot, peg_backend.scene)
     with pytest.raises(MissingCapability, match="can't restore states; use another backend"):
-        try_segment(arm, peg_model, peg_demonstration, peg_annotation, AugmentConfig(), 0, 0)
+        SegmentMaker(arm, peg_demonstration, peg_annotation, AugmentConfig())(0, 0)
     arm.close()
 
 
@@ -578,6 +663,7 @@ def test_a_request_that_is_refused_replaces_nothing_even_if_it_may_overwrite(
         ({"seed": -1}, InvalidInput, "seed: expected a whole number >= 0"),
         ({"duration": 0.0}, InvalidInput, "duration: expected a finite number > 0"),
         ({"duration": np.nan}, InvalidInput, "duration: expected a finite number > 0"),
+        ({"margin": -0.001}, InvalidInput, "margin: expected a finite number >= 0 m"),
         ({"strategy": "srat"}, UnknownName, "did you mean 'sart'"),
     ],
 )

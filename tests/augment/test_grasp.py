@@ -6,19 +6,21 @@ import functools
 import numpy as np
 import pytest
 
-from sart_toolkit.augment import engine
-from sart_toolkit.augment.engine import KEPT, AugmentConfig, try_segment
+from sart_toolkit.augment import segments
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.segments import KEPT, SegmentMaker
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.records import Annotation, PrecisionSphere, convergence_waypoint
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.storage import load_demonstration, save_demonstration
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import suggest_annotation
+from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +55,13 @@ def carried_at(task, model, shown):
 
 
 @pytest.fixture(scope="module")
-def annotation(task, model, shown):
-    return suggest_annotation(shown, model.spec, task.scene)
+def surroundings(task, model, shown):
+    return ExactSurroundings(DemonstratedScene(shown, model.spec, task.scene))
+
+
+@pytest.fixture(scope="module")
+def annotation(shown, surroundings):
+    return suggest_annotation(shown, surroundings)
 
 
 def sphere_at(shown, t, radius):
@@ -96,7 +103,7 @@ def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, carrie
 
 
 def test_a_waypoint_in_a_contact_or_at_the_gripper_s_event_is_refused_with_that_reason(
-    task, model, shown, carried_at
+    shown, surroundings, carried_at
 ):
     closing = next(s for s in range(len(shown)) if shown.steps.commanded_gripper[s] > 0.5)
     standing = carried_at.index({"toolbox"}) + 1
@@ -105,7 +112,7 @@ def test_a_waypoint_in_a_contact_or_at_the_gripper_s_event_is_refused_with_that_
         (standing, r"\(contact table / toolbox\)"),
     ):
         with pytest.raises(InvalidInput, match=rf"waypoint {t}: no room for a sphere .* {reason}"):
-            suggest_annotation(shown, model.spec, task.scene, [t])
+            suggest_annotation(shown, surroundings, [t])
 
 
 def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(
@@ -113,7 +120,7 @@ def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(
 ):
     config = AugmentConfig(n=8)
     i = len(annotation.spheres) - 1
-    attempt = try_segment(backend, model, shown, annotation, config, i, 0)
+    attempt = SegmentMaker(backend, shown, annotation, config)(i, 0)
     assert attempt.outcome == KEPT
     lifted = backend.observe().Ts_world_body["toolbox"][2, 3]
     assert lifted > 0.01
@@ -126,18 +133,18 @@ def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
     t = next(s for s in range(len(shown)) if carried_at[s] and height[s] > 0.012)
     config = AugmentConfig(n=8)
     outcomes = {
-        try_segment(backend, model, shown, sphere_at(shown, t, 0.04), config, 0, k).outcome
+        SegmentMaker(backend, shown, sphere_at(shown, t, 0.04), config)(0, k).outcome
         for k in range(12)
     }
-    assert "contact table / toolbox" in outcomes
+    assert "path too close toolbox / table" in outcomes
 
 
 def test_a_segment_on_which_the_object_slips_is_rejected(
     backend, model, shown, annotation, monkeypatch
 ):
-    monkeypatch.setattr(engine, "_SLIP", 0.0)
+    monkeypatch.setattr(segments, "_SLIP", 0.0)
     i = len(annotation.spheres) - 1
-    attempt = try_segment(backend, model, shown, annotation, AugmentConfig(n=8), i, 0)
+    attempt = SegmentMaker(backend, shown, annotation, AugmentConfig(n=8))(i, 0)
     assert attempt.outcome == "toolbox slipped in the grasp"
     assert attempt.episode is None
 
@@ -148,10 +155,9 @@ def test_a_segment_on_which_the_open_fingers_touch_the_object_is_rejected(
     t = next(s for s in range(len(shown)) if shown.steps.commanded_gripper[s] > 0.5) - 2
     config = AugmentConfig(n=8)
     outcomes = [
-        try_segment(backend, model, shown, sphere_at(shown, t - 1, 0.003), config, 0, k)
-        for k in range(2)
+        SegmentMaker(backend, shown, sphere_at(shown, t - 1, 0.003), config)(0, k) for k in range(2)
     ]
     assert all(attempt.outcome == KEPT for attempt in outcomes)
     wide = sphere_at(shown, t - 1, 0.06)
-    tries = functools.partial(try_segment, backend, model, shown, wide, config, 0)
-    assert any("contact" in tries(k).outcome for k in range(8))
+    tries = functools.partial(SegmentMaker(backend, shown, wide, config), 0)
+    assert any("path too close" in tries(k).outcome for k in range(8))

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.backends.interface import Observation
 from sart_toolkit.errors import MissingExtra, UnknownName
+from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scene.spec import SceneSpec
 from sart_toolkit.testing.bench import find_backend, make_bench
@@ -23,6 +25,27 @@ def test_a_backend_has_the_name_that_it_has_in_the_table(name):
         assert find_backend(name).name == name
     except MissingExtra as error:
         pytest.skip(str(error))
+
+
+def test_an_observation_without_a_joint_path_has_one_of_no_rows():
+    seen = Observation(np.zeros(6), np.zeros(6), 0.0, np.eye(4), 0.0)
+    assert seen.joint_path.shape == (0, 6)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_the_joint_path_is_measured_at_each_physics_step(name):
+    """Where the motors can't keep up with the commands, too."""
+    try:
+        bench = make_bench(name, "ur5e_hande")
+    except MissingExtra as error:
+        pytest.skip(str(error))
+    bench.command(bench.ready + 0.5)
+    seen = bench.see()
+    assert len(seen.joint_path) == PHYSICS_HZ // CONTROL_HZ
+    speeds = np.diff(seen.joint_path, axis=0) * PHYSICS_HZ
+    assert (np.diff(speeds[:, 0]) > 0.5).all()
+    np.testing.assert_allclose(speeds[-1], seen.dq, rtol=0, atol=1e-3)
+    bench.backend.close()
 
 
 @pytest.fixture(scope="module", params=BACKENDS)

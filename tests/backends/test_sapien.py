@@ -20,7 +20,7 @@ from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, look_at
-from sart_toolkit.scene.clearance import primitive
+from sart_toolkit.scene.collision import primitive
 from sart_toolkit.scene.spec import Body, Detent, Joint, Light, SceneSpec
 from sart_toolkit.workers import worker_map
 

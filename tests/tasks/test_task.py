@@ -17,12 +17,13 @@ from sart_toolkit.records import RECORD_HZ
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.scene.clearance import ClearanceModel
+from sart_toolkit.scene.collision import CollisionModel
+from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import SessionConfig, record_demonstration
-from sart_toolkit.teach.suggest import suggest_annotation
+from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 
 @pytest.fixture(scope="module", params=TASKS)
@@ -124,6 +125,7 @@ def test_at_the_start_there_is_room_for_a_sphere_that_covers_every_placement(tas
     needed = 0.11 if task.name == "peg_in_hole" else 0.20
     fingers = model.spec.gripper.finger_links
     first = task.initial_state(model, Placement())
+    collision = CollisionModel(model.spec, task.scene)
     for placement in _corners(task):
         state = task.initial_state(model, placement)
         np.testing.assert_array_equal(state.q, first.q)
@@ -135,12 +137,14 @@ def test_at_the_start_there_is_room_for_a_sphere_that_covers_every_placement(tas
         carried = task.scene.grasped(touching, fingers)
         assert not task.scene.outer_contacts(touching, carried)
         seen = backend.observe()
-        opening = RobotModel(model.spec, task.scene.held, float(np.clip(seen.gripper, 0, 1)))
-        clearances = ClearanceModel(opening, task.scene)
-        bodies = clearances.tool_clearances(seen.q, seen.Ts_world_body, carried)
-        nearest = min((body.nearest for body in bodies), key=lambda pair: pair.distance)
+        placed = collision.placed(
+            seen.Ts_world_body,
+            float(np.clip(seen.gripper, 0, 1)),
+            {name: inverse(seen.T_world_tool) @ seen.Ts_world_body[name] for name in carried},
+        )
+        nearest = placed.tool_clearances(seen.q)[0]
         assert nearest.distance > needed, nearest
-        assert clearances.arm_distance(seen.q, seen.Ts_world_body, carried).distance > 0
+        assert placed.distances(seen.q).min() > 0
         assert not task.success(seen)
         assert task.shortfall(seen)
 
@@ -189,7 +193,8 @@ def test_a_sphere_at_the_start_covers_every_placement(task, model):
     config = SessionConfig(cameras=(), keep_states=False)
     demonstration = record_demonstration(backend, task, model, operator, config=config)
     backend.close()
-    annotation = suggest_annotation(demonstration, model.spec, task.scene, [0])
+    scene = DemonstratedScene(demonstration, model.spec, task.scene)
+    annotation = suggest_annotation(demonstration, ExactSurroundings(scene), [0])
     assert annotation.spheres[0].radius >= np.hypot(*[task.placement_range] * 2)
 
 

@@ -11,9 +11,11 @@ from sart_toolkit.augment.strategies import SamplingConfig, sart
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import pose
 from sart_toolkit.records import convergence_waypoint
-from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.clearance import ClearanceModel
+from sart_toolkit.scene.demonstrated import DemonstratedScene
+from sart_toolkit.teach import suggest as suggest_module
 from sart_toolkit.teach.suggest import (
+    ExactSurroundings,
+    Gap,
     SuggestConfig,
     certified_radius,
     suggest_annotation,
@@ -21,59 +23,90 @@ from sart_toolkit.teach.suggest import (
 )
 
 
-def _swept(r, reach, nu):
-    return r + 2 * reach * np.sin(min(nu * r, np.pi) / 2)
+def gap_at(distance, points, normal=(0.0, 0.0, 1.0)):
+    """A tool part with its lowest point `distance` above an obstacle that fills all below."""
+    points, normal = np.array(points), np.array(normal)
+    support = (points @ normal).min() - distance
+    return Gap("part", "obstacle", distance, normal, points, support)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+vectors = st.tuples(*[st.floats(-1, 1)] * 3)
+turns = vectors.filter(lambda v: np.linalg.norm(v) > 0.1)
+parts = st.lists(vectors.map(lambda v: 0.2 * np.array(v)), min_size=1, max_size=8)
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(
-    clearance=st.floats(-0.05, 0.6),
-    reach=st.floats(0, 0.4),
+    points=parts,
+    distance=st.floats(-0.05, 0.6),
     margin=st.floats(0, 0.02),
     nu=st.floats(0, 30),
     largest=st.floats(0.01, 0.5),
 )
-def test_the_certified_radius_is_the_largest_whose_sweep_fits_the_clearance(
-    clearance, reach, margin, nu, largest
-):
-    r = certified_radius(clearance, reach, margin, nu, largest)
+def test_the_certified_radius_is_the_largest_that_fits(points, distance, margin, nu, largest):
+    gap = gap_at(distance, points)
+    r = certified_radius(gap, margin, nu, largest)
     assert 0 <= r <= largest
-    if r > 0:
-        assert _swept(r, reach, nu) + margin <= clearance
-    if r < largest:
-        assert _swept(r + 1e-9, reach, nu) + margin > clearance - 1e-12
+    assert r == 0 or gap.fits(r, margin, nu)
+    assert r == largest or not gap.fits(r + 1e-9, margin, nu)
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(
+    points=parts,
+    normal=turns,
+    distance=st.floats(0.001, 0.3),
+    margin=st.floats(0, 0.02),
+    nu=st.floats(0, 20),
+    direction=turns,
+    axis=turns,
+    share=st.floats(-1, 1),
+)
+def test_no_pose_within_a_certified_radius_brings_a_part_nearer_than_the_margin(
+    points, normal, distance, margin, nu, direction, axis, share
+):
+    normal = np.array(normal) / np.linalg.norm(normal)
+    gap = gap_at(distance, points, normal)
+    r = certified_radius(gap, margin, nu, 0.5)
+    turn = share * nu * r * np.array(axis) / np.linalg.norm(axis)
+    for way in (direction, -normal):
+        offset = r * np.array(way) / np.linalg.norm(way)
+        moved = gap.points @ pose(rotvec=turn)[:3, :3].T + offset
+        nearest = (moved @ normal).min() - gap.support
+        assert nearest >= min(margin, distance) - 1e-12
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
-@given(
-    direction=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1),
-    axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1),
-    point=st.tuples(*[st.floats(-1, 1)] * 3),
-    r=st.floats(0.001, 0.3),
-    nu=st.floats(0, 20),
-    share=st.floats(-1, 1),
-)
-def test_no_point_of_a_body_moves_farther_than_the_certificate_allows(
-    direction, axis, point, r, nu, share
-):
-    point = 0.2 * np.array(point)
-    moved = r * np.array(direction) / np.linalg.norm(direction) + pose(
-        rotvec=share * nu * r * np.array(axis) / np.linalg.norm(axis)
-    )[:3, :3] @ (point)
-    assert np.linalg.norm(moved - point) <= _swept(r, np.linalg.norm(point), nu) + 1e-12
+@given(points=parts, distance=st.floats(0.01, 0.3), nu=st.floats(0, 5))
+def test_by_a_plane_a_certified_radius_can_not_be_larger(points, distance, nu):
+    """Some turn within nu r really brings the lowest point as near as the proof fears."""
+    gap = gap_at(distance, points)
+    r = certified_radius(gap, 0.0, nu, 1.0)
+    if r == 1.0 or nu * r > 1.0:
+        return
+    grown = r + 1e-6
+    lowest = np.inf
+    for x in gap.points:
+        across = np.array([x[1], -x[0], 0.0])
+        # Straight above or below the origin any level axis does.
+        across = across if np.linalg.norm(across) > 1e-9 else np.array([1.0, 0.0, 0.0])
+        across *= nu * grown / np.linalg.norm(across)
+        for turn in (across, -across):
+            lowest = min(lowest, (pose(rotvec=turn)[:3, :3] @ x)[2])
+    assert lowest - grown - gap.support < 1e-9 + 1e-3 * distance
 
 
-@pytest.fixture(scope="module")
-def clearances(peg_task, peg_model, peg_demonstration):
-    """Clearance with the gripper as measured at a waypoint."""
+def suggested(demonstration, scene, *args, **options):
+    return suggest_annotation(demonstration, ExactSurroundings(scene), *args, **options)
 
-    def at(t):
-        gripper = float(peg_demonstration.steps.measured_gripper[t])
-        return ClearanceModel(
-            RobotModel(peg_model.spec, peg_task.scene.held, gripper), peg_task.scene
-        )
 
-    return at
+class Elsewhere:
+    """The surroundings of a demonstration with the scene's bodies 5 m below."""
+
+    def __init__(self, demonstration, robot, scene):
+        Ts = {k: T @ pose([0, 0, -5]) for k, T in demonstration.body_Ts_world.items()}
+        shown = dataclasses.replace(demonstration, body_Ts_world=Ts)
+        self.surroundings = ExactSurroundings(DemonstratedScene(shown, robot, scene))
 
 
 def test_suggested_spheres_start_at_waypoint_0_and_tile_the_free_part(
@@ -94,14 +127,12 @@ def test_suggested_spheres_start_at_waypoint_0_and_tile_the_free_part(
     assert peg_annotation.settings == dataclasses.asdict(config)
 
 
-def test_between_two_spheres_no_waypoint_has_room(
-    peg_task, peg_model, peg_demonstration, peg_annotation
-):
+def test_between_two_spheres_no_waypoint_has_room(peg_demonstration, peg_scene, peg_annotation):
     spheres = peg_annotation.spheres
     for sphere, following in zip(spheres, spheres[1:], strict=False):
         for t in range(convergence_waypoint(peg_demonstration, sphere), following.waypoint):
             with pytest.raises(InvalidInput, match="no room"):
-                suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [t])
+                suggested(peg_demonstration, peg_scene, [t])
 
 
 def test_suggested_lengths_are_whole_micrometres(peg_annotation):
@@ -116,117 +147,142 @@ def test_the_first_sphere_covers_every_placement(peg_task, peg_annotation):
 
 
 def test_what_limits_a_radius_is_a_pair_at_the_stated_clearance(
-    peg_demonstration, peg_annotation, clearances
+    peg_demonstration, peg_scene, peg_annotation
 ):
     for sphere in peg_annotation.spheres:
-        t = sphere.waypoint
-        bodies = {name: Ts[t] for name, Ts in peg_demonstration.body_Ts_world.items()}
-        q = peg_demonstration.steps.joint_positions[t]
-        pairs = [body.nearest for body in clearances(t).tool_clearances(q, bodies)]
-        stated = {f"{pair.a} / {pair.b}": pair.distance for pair in pairs}
-        assert stated[sphere.limited_by] == pytest.approx(sphere.clearance, abs=5e-4)
+        q = peg_demonstration.steps.joint_positions[sphere.waypoint]
+        placed = peg_scene.placed(sphere.waypoint)
+        stated = {}
+        for k in placed.tool_pairs():
+            found = placed.witness(q, k)
+            stated.setdefault(" / ".join(found.pair), []).append(found.distance)
+        assert np.abs(np.array(stated[sphere.limited_by]) - sphere.clearance).min() < 2e-6
         assert sphere.radius < sphere.clearance - SuggestConfig().margin + 1e-12
 
 
-def test_every_pose_that_augmentation_draws_keeps_tool_and_arm_clear(
-    peg_demonstration, peg_annotation, clearances
+def test_every_pose_that_augmentation_draws_keeps_the_whole_robot_clear(
+    peg_demonstration, peg_scene, peg_annotation
 ):
     """Monte Carlo by the paper's law, on each sphere and inside it."""
     rng = np.random.default_rng(0)
     margin = SuggestConfig().margin
     for sphere in peg_annotation.spheres:
-        t = sphere.waypoint
-        model = clearances(t)
-        bodies = {name: Ts[t] for name, Ts in peg_demonstration.body_Ts_world.items()}
+        placed = peg_scene.placed(sphere.waypoint)
+        near = peg_demonstration.steps.joint_positions[sphere.waypoint]
         for i in range(60):
             radius = sphere.radius * (1.0 if i % 2 else rng.uniform())
             drawn = dataclasses.replace(sphere, radius=max(radius, 1e-6))
             T = sart(peg_demonstration, drawn, rng, SamplingConfig()).T_world_sampled
-            q = model.model.ik(T, peg_demonstration.steps.joint_positions[t])
-            tool = min(body.nearest.distance for body in model.tool_clearances(q, bodies))
-            # The gripper's opening is rounded to a hundredth for the certificate.
-            assert tool >= margin - 5e-4
-            assert model.arm_distance(q, bodies).distance >= 0
+            distances = placed.distances(placed.kinematics.ik(T, near))
+            assert distances[placed.tool_pairs()].min() >= margin - 1e-6
+            assert distances.min() >= 0
+
+
+def test_a_little_larger_than_suggested_some_pose_would_touch(
+    peg_demonstration, peg_scene, peg_annotation
+):
+    """Straight towards the obstacle, and turned so that the nearest corner comes down."""
+    sphere = peg_annotation.spheres[1]
+    assert sphere.limited_by == "peg / block"
+    placed = peg_scene.placed(sphere.waypoint)
+    gap = next(ExactSurroundings(peg_scene).gaps(sphere.waypoint))
+    grown = 1.15 * sphere.radius
+    lowest = gap.points[np.argmin(gap.points @ gap.normal)]
+    axis = np.cross(lowest, gap.normal)
+    T = sphere.T_world_key.copy()
+    for sign in (1, -1):
+        turn = sign * 2.0 * grown * axis / max(np.linalg.norm(axis), 1e-12)
+        T[:3, :3] = pose(rotvec=turn)[:3, :3] @ sphere.T_world_key[:3, :3]
+        T[:3, 3] = sphere.T_world_key[:3, 3] - grown * gap.normal
+        near = peg_demonstration.steps.joint_positions[sphere.waypoint]
+        if placed.distances(placed.kinematics.ik(T, near)).min() < 0:
+            return
+    raise AssertionError("nothing touched")
 
 
 def test_a_rotation_free_augmentation_gets_larger_spheres_and_a_margin_smaller_ones(
-    peg_task, peg_model, peg_demonstration, peg_annotation
+    peg_demonstration, peg_scene
 ):
     def first(**changes):
         config = SuggestConfig(**changes)
-        return (
-            suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [19], config)
-            .spheres[0]
-            .radius
-        )
+        return suggested(peg_demonstration, peg_scene, [19], config).spheres[0].radius
 
     assert first(rotation_per_metre=0.0) > first() > first(margin=0.005)
 
 
-def test_the_arm_s_reach_and_own_links_shrink_a_radius(peg_demonstration, clearances):
-    steps = peg_demonstration.steps
-    far = {name: Ts[0] @ pose([0, 0, -5]) for name, Ts in peg_demonstration.body_Ts_world.items()}
-    q, T = steps.joint_positions[0], steps.measured_Ts_world_tool[0]
-    config = SuggestConfig(max_radius=2.0, rotation_per_metre=0.1)
-    found = suggest_radius(clearances(0), q, T, far, config)
-    assert 0.1 < found.radius < 1.0
-    assert found.limited_by != "max_radius" and "table" not in found.limited_by
-
-
-def test_with_nothing_near_the_largest_radius_is_suggested(peg_demonstration, clearances):
-    steps = peg_demonstration.steps
-    far = {name: Ts[0] @ pose([0, 0, -5]) for name, Ts in peg_demonstration.body_Ts_world.items()}
-    config = SuggestConfig(max_radius=0.05)
-    found = suggest_radius(
-        clearances(0), steps.joint_positions[0], steps.measured_Ts_world_tool[0], far, config
-    )
-    assert (found.radius, found.limited_by) == (0.05, "max_radius")
-    assert 4.5 < found.clearance < 5.5
-
-
-def test_chosen_waypoints_are_annotated_in_order_without_repeats(
-    peg_task, peg_model, peg_demonstration
+def test_where_nothing_is_near_the_arm_itself_limits_a_radius(
+    peg_demonstration, peg_task, peg_model
 ):
-    seen = []
-    annotation = suggest_annotation(
-        peg_demonstration, peg_model.spec, peg_task.scene, [10, 0, 10], progress=seen.append
+    far = Elsewhere(peg_demonstration, peg_model.spec, peg_task.scene).surroundings
+    config = SuggestConfig(max_radius=2.0, rotation_per_metre=0.1)
+    found = suggest_radius(far, peg_demonstration, 0, config)
+    assert 0.1 < found.radius < 1.0
+    assert found.limited_by in ("reach", "singularity", "joint limit") or "link" in found.limited_by
+    found = suggest_radius(far, peg_demonstration, 0, SuggestConfig(max_radius=0.05))
+    assert (found.radius, found.limited_by) == (0.05, "max_radius")
+    assert 0.3 < found.clearance < 5.5
+
+
+def test_a_joint_limit_and_a_singular_pose_limit_a_radius(
+    peg_demonstration, peg_task, peg_model, monkeypatch
+):
+    far = Elsewhere(peg_demonstration, peg_model.spec, peg_task.scene).surroundings
+    q = peg_demonstration.steps.joint_positions[0]
+    monkeypatch.setattr(suggest_module, "_LEAST_SINGULAR_VALUE", 1.0)
+    found = suggest_radius(far, peg_demonstration, 0)
+    assert (found.radius, found.limited_by) == (0.0, "singularity")
+    monkeypatch.setattr(far.kinematics, "upper", q + 0.06)
+    assert suggest_radius(far, peg_demonstration, 0).limited_by == "joint limit"
+
+
+def test_the_waypoint_that_a_segment_starts_from_must_be_clear_too(
+    peg_demonstration, peg_task, peg_model
+):
+    """The block stands in the robot's way from one waypoint on."""
+    Ts = np.array(peg_demonstration.body_Ts_world["block"])
+    Ts[12:, 2, 3] += 0.15
+    shown = dataclasses.replace(
+        peg_demonstration, body_Ts_world={**peg_demonstration.body_Ts_world, "block": Ts}
     )
+    scene = DemonstratedScene(shown, peg_model.spec, peg_task.scene)
+    found = suggest_radius(ExactSurroundings(scene), shown, 0)
+    p = shown.steps.measured_Ts_world_tool[:, :3, 3]
+    assert "at waypoint" in found.limited_by
+    assert found.radius < np.linalg.norm(p[12] - p[0])
+
+
+def test_chosen_waypoints_are_annotated_in_order_without_repeats(peg_demonstration, peg_scene):
+    seen = []
+    annotation = suggested(peg_demonstration, peg_scene, [10, 0, 10], progress=seen.append)
     assert [sphere.waypoint for sphere in annotation.spheres] == seen == [0, 10]
 
 
 @pytest.mark.parametrize("probes", [1, 10, 64])
 def test_any_number_of_probes_works_without_a_warning(
-    peg_task, peg_model, peg_demonstration, probes
+    peg_task, peg_scene, peg_demonstration, probes
 ):
-    config = SuggestConfig(probes=probes)
-    annotation = suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [0], config)
+    annotation = suggested(peg_demonstration, peg_scene, [0], SuggestConfig(probes=probes))
     assert annotation.spheres[0].radius > peg_task.placement_range
 
 
 @pytest.mark.parametrize("waypoint", [-1, 10_000])
-def test_a_waypoint_outside_the_demonstration_is_refused(
-    peg_task, peg_model, peg_demonstration, waypoint
-):
+def test_a_waypoint_outside_the_demonstration_is_refused(peg_scene, peg_demonstration, waypoint):
     with pytest.raises(InvalidInput, match=rf"waypoint {waypoint}: expected 0 to \d+"):
-        suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [waypoint])
+        suggested(peg_demonstration, peg_scene, [waypoint])
 
 
-def test_the_last_waypoint_is_refused_for_nothing_follows_it(
-    peg_task, peg_model, peg_demonstration
-):
+def test_the_last_waypoint_is_refused_for_nothing_follows_it(peg_scene, peg_demonstration):
     last = len(peg_demonstration) - 1
     with pytest.raises(InvalidInput, match=f"waypoint {last}: expected 0 to {last - 1}"):
-        suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [last])
+        suggested(peg_demonstration, peg_scene, [last])
 
 
-def test_where_no_waypoint_has_room_the_error_says_what_to_do(
-    peg_task, peg_model, peg_demonstration
-):
+def test_where_no_waypoint_has_room_the_error_says_what_to_do(peg_scene, peg_demonstration):
     config = SuggestConfig(min_radius=0.5, max_radius=0.5)
     with pytest.raises(InvalidInput, match="no waypoint has room for a sphere of 500.0 mm"):
-        suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, config=config)
+        suggested(peg_demonstration, peg_scene, config=config)
     with pytest.raises(InvalidInput, match="waypoint 0: no room .* clearance .* mm"):
-        suggest_annotation(peg_demonstration, peg_model.spec, peg_task.scene, [0], config=config)
+        suggested(peg_demonstration, peg_scene, [0], config=config)
 
 
 @pytest.mark.parametrize(

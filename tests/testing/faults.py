@@ -146,6 +146,37 @@ class WrongClock(PyBulletBackend):
         self._time = before + 0.033
 
 
+class JointPathIsLate(PyBulletBackend):
+    """It is that of the control period before."""
+
+    _measured: list[list[float]]
+
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
+        super().__init__(robot, scene, image_size)
+        self._measured = []
+
+    def step(self) -> None:
+        late = self._measured
+        super().step()
+        self._measured, self._joint_path = self._joint_path, late
+
+
+class JointPathSinceTheReset(PyBulletBackend):
+    """It is that of all control periods, not of the last one."""
+
+    def step(self) -> None:
+        before = self._joint_path
+        super().step()
+        self._joint_path = before + self._joint_path
+
+
+class JointPathOutlivesARestore(PyBulletBackend):
+    def restore(self, state: bytes) -> None:
+        path = self._joint_path
+        super().restore(state)
+        self._joint_path = path
+
+
 class ToolIsTheFlange(PyBulletBackend):
     def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
         seen = super().observe(cameras, image_size)

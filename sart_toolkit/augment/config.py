@@ -1,0 +1,40 @@
+"""What an augmentation is to generate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sart_toolkit.augment.strategies import SamplingConfig, get_strategy
+from sart_toolkit.errors import InvalidInput
+from sart_toolkit.poses import check_positive
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """What to generate.
+
+    `n`: trajectories in all, the demonstration among them; the others go round-robin over the
+    spheres. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
+    proved to keep `margin` [m] free. `camera`: whose pictures are recorded,
+    `None` for none.
+    """
+
+    n: int = 40
+    strategy: str = "sart"
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    duration: float = 2.0
+    margin: float = 0.0002
+    seed: int = 0
+    camera: str | None = "wrist"
+
+    def __post_init__(self) -> None:
+        if self.n < 2:
+            raise InvalidInput(f"n: expected at least 2 (the demonstration counts), got {self.n}")
+        if self.seed < 0:
+            raise InvalidInput(f"seed: expected a whole number >= 0, got {self.seed}")
+        check_positive("duration", self.duration, "s")
+        if not (np.isfinite(self.margin) and self.margin >= 0):
+            raise InvalidInput(f"margin: expected a finite number >= 0 m, got {self.margin}")
+        get_strategy(self.strategy)

@@ -1,0 +1,111 @@
+"""Joint paths over a parameter s in [0, 1]: smooth ones to command, and measured ones."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+
+from sart_toolkit.errors import InvalidInput
+from sart_toolkit.poses import Array, check_array, frozen
+
+_DEGREE = 5
+
+
+class SplinePath:
+    """A quintic spline of joint configurations, its fourth derivative continuous.
+
+    Attributes:
+        spline: q(s) `(n,)` [rad] as SciPy has it.
+        most: the greatest |q'|, |q''| and |q'''| `(3, n)`, from the derivatives' B-spline
+            coefficients, which no spline exceeds.
+    """
+
+    def __init__(self, spline: BSpline) -> None:
+        if spline.k != _DEGREE or spline.t[_DEGREE] != 0.0 or spline.t[-_DEGREE - 1] != 1.0:
+            raise InvalidInput("spline: expected a quintic one over [0, 1]")
+        self.spline = spline
+        derivatives = _derivative_coefficients(spline.t, spline.c, 3)
+        self.most = frozen([np.abs(c).max(0) for c in derivatives])
+
+    @classmethod
+    def through(cls, configurations: Array) -> SplinePath:
+        """The spline through configurations `(m, n)` at equal steps of s, m at least 6.
+
+        Raises:
+            InvalidInput: too few, or not finite.
+        """
+        q = check_array("configurations", configurations, (None, None))
+        if len(q) <= _DEGREE:
+            raise InvalidInput(f"configurations: expected at least {_DEGREE + 1}, got {len(q)}")
+        knots, solve = _interpolation(len(q))
+        return cls(BSpline.construct_fast(knots, solve @ q, _DEGREE))
+
+    def positions(self, s: Array) -> Array:
+        """The configurations `(k, n)` [rad] at parameters `(k,)`."""
+        return np.asarray(self.spline(np.asarray(s, dtype=np.float64)))
+
+    def bulge(self, start: Array, end: Array) -> Array:
+        """Bounds `(k, n)` [rad] of the distance from each interval's chord: |q''| h² / 8."""
+        h = np.asarray(end) - np.asarray(start)
+        return h[:, None] ** 2 / 8 * self.most[1]
+
+
+class PolylinePath:
+    """Straight joint motions between configurations `(m, n)` [rad], such as measured ones.
+
+    The parameter s counts configurations, from 0 at the first to 1 at the last.
+    """
+
+    def __init__(self, configurations: Array) -> None:
+        q = check_array("configurations", configurations, (None, None))
+        if len(q) < 2:
+            raise InvalidInput(f"configurations: expected at least 2, got {len(q)}")
+        self.configurations = frozen(q)
+
+    def positions(self, s: Array) -> Array:
+        """The configurations `(k, n)` [rad] at parameters `(k,)`."""
+        at = np.asarray(s) * (len(self.configurations) - 1)
+        i = np.minimum(at.astype(int), len(self.configurations) - 2)
+        fraction = (at - i)[:, None]
+        return (1 - fraction) * self.configurations[i] + fraction * self.configurations[i + 1]
+
+    def bulge(self, start: Array, end: Array) -> Array:
+        """Bounds `(k, n)` [rad] of the distance from each interval's chord.
+
+        Each configuration in an interval is compared with the nearest point of the chord.
+        """
+        last = len(self.configurations) - 1
+        ends = self.positions(start), self.positions(end)
+        bulges = np.zeros((len(ends[0]), self.configurations.shape[1]))
+        for k, (a, b) in enumerate(np.stack([start, end], 1) * last):
+            inside = self.configurations[int(np.ceil(a)) : int(np.floor(b)) + 1]
+            if len(inside):
+                chord = ends[1][k] - ends[0][k]
+                along = (inside - ends[0][k]) @ chord / max(float(chord @ chord), 1e-300)
+                nearest = ends[0][k] + np.clip(along, 0.0, 1.0)[:, None] * chord
+                bulges[k] = np.abs(inside - nearest).max(0)
+        return bulges
+
+
+@functools.cache
+def _interpolation(count: int) -> tuple[Array, Array]:
+    """The knots of a quintic spline through `count` points, and the matrix to its coefficients."""
+    spline = make_interp_spline(np.linspace(0.0, 1.0, count), np.eye(count), k=_DEGREE)
+    return frozen(spline.t), frozen(spline.c)
+
+
+def _derivative_coefficients(knots: Array, coefficients: Array, order: int) -> list[Array]:
+    """B-spline coefficients of the first `order` derivatives.
+
+    c'_i = k (c_i+1 - c_i) / (t_i+k+1 - t_i+1) for degree k (de Boor, A Practical Guide to Splines).
+    """
+    found = []
+    t, c = knots, coefficients
+    for degree in range(_DEGREE, _DEGREE - order, -1):
+        width = t[degree + 1 : -1] - t[1 : -degree - 1]
+        c = degree * np.diff(c, axis=0) / width[:, None]
+        t = t[1:-1]
+        found.append(c)
+    return found

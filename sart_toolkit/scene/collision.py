@@ -1,0 +1,593 @@
+"""One collision model of robot and scene: convex parts on Pinocchio's joints, distances by coal."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from sart_toolkit.errors import InvalidInput, unknown_name
+from sart_toolkit.poses import Array, check_pose, frozen, inverse
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec, Shape
+from sart_toolkit.scene.spec import SceneSpec
+
+Index = NDArray[np.intp]
+_SPHERES = 4
+# Links of joints nearer to each other than this meet in the joints between them.
+_JOINTS_APART = 2
+
+
+@dataclass(frozen=True)
+class PairDistance:
+    """Distance [m] between two bodies, by name; negative where they overlap.
+
+    `p_a`, `p_b (3,)` are the witness points in the world: the nearest, or where they overlap the
+    deepest, point of each.
+    """
+
+    a: str
+    b: str
+    distance: float
+    p_a: Array
+    p_b: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "p_a", frozen(self.p_a))
+        object.__setattr__(self, "p_b", frozen(self.p_b))
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """The two names."""
+        return self.a, self.b
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexPart:
+    """A convex part of a body: its geometry and its pose `T_joint_part (4, 4)` on joint `joint`.
+
+    `joint` counts the arm's joints from 1; what no joint moves is on joint 0, the world. The hull
+    of `points (n, 3)`, in the joint's frame, encloses the part.
+    """
+
+    body: str
+    joint: int
+    geometry: coal.CollisionGeometry
+    T_joint_part: Array
+    points: Array
+
+    @functools.cached_property
+    def sphere(self) -> tuple[Array, float]:
+        """Centre `(3,)` and radius [m] of a sphere about the part, in the joint's frame."""
+        centre = (self.points.min(0) + self.points.max(0)) / 2
+        return centre, float(np.linalg.norm(self.points - centre, axis=1).max())
+
+    @functools.cached_property
+    def box(self) -> tuple[Array, Array, Array]:
+        """Axes `(3, 3)`, centre `(3,)` and half edges `(3,)` of a box about it, joint's frame."""
+        return _box((self,))
+
+    @functools.cached_property
+    def reach(self) -> float:
+        """How far [m] any point of the part is from the joint's origin."""
+        return float(np.linalg.norm(self.points, axis=1).max())
+
+
+class CollisionModel:
+    """The convex parts of a robot and of a scene, to be put where their bodies are.
+
+    Robot links are the convex hulls of their collision meshes, which enclose them.
+    """
+
+    def __init__(self, robot: RobotSpec, scene: SceneSpec) -> None:
+        """Read the collision geometry of robot and scene.
+
+        Raises:
+            InvalidInput: a body has no shape that collides, or a part of the robot is neither a
+                mesh nor a box, sphere or cylinder.
+        """
+        self.robot = robot
+        self.scene = scene
+        self.kinematics = RobotModel(robot, scene.held)
+        self._parts = robot_parts(self.kinematics)
+        for body in scene.bodies:
+            if not any(shape.collides for shape in body.shapes):
+                raise InvalidInput(
+                    f"body {body.name!r}: no shape of it collides, so nothing can be proved about "
+                    "it; let one collide, or draw it as part of another body"
+                )
+        self._shapes = [
+            (body.name, shape.T_body_shape, coal_geometry(shape), shape.corners())
+            for body in scene.bodies
+            for shape in body.shapes
+            if shape.collides
+        ]
+        n = len(robot.arm_joints)
+        home = _link_poses(self.kinematics)
+        self._T_joint_tool = home[robot.tool_frame]
+        self._links = {part.body: inverse(home[part.body]) for part in self._parts}
+        self._moved_by_gripper = {part.body for part in self._parts if part.joint == n}
+        self._self_pairs: list[tuple[int, int]] | None = None
+
+    @functools.lru_cache(maxsize=32)  # noqa: B019 - models live as long as their process
+    def _robot_parts(self, gripper: float) -> list[ConvexPart]:
+        """The robot's parts with its gripper at an opening."""
+        poses = _link_poses(RobotModel(self.robot, self.scene.held, gripper))
+        parts = []
+        for part in self._parts:
+            T = poses[part.body] @ self._links[part.body]
+            points = part.points @ T[:3, :3].T + T[:3, 3]
+            parts.append(
+                ConvexPart(part.body, part.joint, part.geometry, T @ part.T_joint_part, points)
+            )
+        return parts
+
+    def placed(
+        self,
+        Ts_world_body: Mapping[str, Array],
+        gripper: float,
+        Ts_tool_carried: Mapping[str, Array] | None = None,
+        allowed: Collection[tuple[str, str]] = (),
+    ) -> PlacedModel:
+        """The model with the scene's bodies, the gripper and what it carries put in their places.
+
+        Args:
+            Ts_world_body: poses `(4, 4)` of the scene's bodies; a carried one's isn't looked at.
+            gripper: opening in [0, 1].
+            Ts_tool_carried: poses `(4, 4)` in the tool frame of the bodies in the grasp.
+            allowed: pairs of names that may touch, about which nothing is said.
+
+        Raises:
+            UnknownName: a body's pose is missing, or a name is of no body or link.
+            InvalidInput: gripper out of range, or not a pose.
+        """
+        carried = dict(Ts_tool_carried or {})
+        names = [body.name for body in self.scene.bodies]
+        for name in carried:
+            if name not in names:
+                raise unknown_name("carried body", name, names)
+        known = {part.body for part in self._parts} | set(names)
+        for name in {name for pair in allowed for name in pair}:
+            if name not in known:
+                raise unknown_name("body or link", name, sorted(known))
+        last = len(self.robot.arm_joints)
+        parts = list(self._robot_parts(round(float(gripper), 3)))
+        n_robot = len(parts)
+        for name, T_body_shape, geometry, corners in self._shapes:
+            if name in carried:
+                T, joint = self._T_joint_tool @ check_pose(name, carried[name]), last
+            elif name in Ts_world_body:
+                T, joint = check_pose(name, Ts_world_body[name]), 0
+            else:
+                raise unknown_name("body", name, Ts_world_body)
+            points = corners @ T[:3, :3].T + T[:3, 3]
+            parts.append(ConvexPart(name, joint, geometry, T @ T_body_shape, points))
+        if self._self_pairs is None:
+            self._self_pairs = self._free_at_home(parts[:n_robot])
+        pairs = list(self._self_pairs)
+        standing = [i for i in range(n_robot, len(parts)) if parts[i].joint == 0]
+        moving = [i for i in range(len(parts)) if parts[i].joint > 0]
+        pairs += [(i, j) for i in moving for j in standing]
+        in_grasp = [i for i in range(n_robot, len(parts)) if parts[i].joint > 0]
+        pairs += [
+            (i, j)
+            for i in in_grasp
+            for j in range(n_robot)
+            if parts[j].joint <= last - _JOINTS_APART
+        ]
+        skipped = {frozenset(pair) for pair in allowed}
+        pairs = [
+            (i, j) for i, j in pairs if frozenset((parts[i].body, parts[j].body)) not in skipped
+        ]
+        return PlacedModel(self.kinematics, parts, pairs, self._T_joint_tool)
+
+    def _free_at_home(self, parts: Sequence[ConvexPart]) -> list[tuple[int, int]]:
+        """Pairs of the robot's parts that can collide: neighbours, and what overlaps at home, not.
+
+        The part that more joints move comes first.
+        """
+        pairs = [
+            (i, j)
+            for i, a in enumerate(parts)
+            for j, b in enumerate(parts)
+            if a.joint - b.joint >= _JOINTS_APART
+        ]
+        model = PlacedModel(self.kinematics, parts, pairs, self._T_joint_tool)
+        apart = model.distances(self.robot.home)
+        overlapping = {
+            (parts[i].body, parts[j].body)
+            for (i, j), distance in zip(pairs, apart, strict=True)
+            if distance <= 0
+        }
+        return [(i, j) for i, j in pairs if (parts[i].body, parts[j].body) not in overlapping]
+
+
+class PlacedModel:
+    """Distances between robot and scene with every body in its place, at any joint configuration.
+
+    The *tool bodies* are what the last arm joint carries: gripper, camera, held objects, and what
+    is in the grasp.
+
+    Attributes:
+        kinematics: the robot's kinematics.
+        parts: all convex parts.
+        pairs: `(p, 2)` indices of parts; the first of a pair is moved by more joints.
+    """
+
+    def __init__(
+        self,
+        kinematics: RobotModel,
+        parts: Sequence[ConvexPart],
+        pairs: Sequence[tuple[int, int]],
+        T_joint_tool: Array,
+    ) -> None:
+        self.kinematics = kinematics
+        self.parts = tuple(parts)
+        self.pairs: Index = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+        self.T_joint_tool = T_joint_tool
+        self._model = kinematics.pinocchio_model
+        self._data = self._model.createData()
+        self._geometry = pin.GeometryModel()
+        for i, part in enumerate(parts):
+            self._geometry.addGeometryObject(
+                pin.GeometryObject(str(i), part.joint, pin.SE3(part.T_joint_part), part.geometry)
+            )
+        for i, j in pairs:
+            self._geometry.addCollisionPair(pin.CollisionPair(i, j))
+        self._placements = self._geometry.createData()
+        self._at: Array | None = None
+
+    def names(self, pair: int) -> tuple[str, str]:
+        """The names of the two bodies of a pair, by its index."""
+        i, j = self.pairs[pair]
+        return self.parts[i].body, self.parts[j].body
+
+    def joint_poses(self, q: Array) -> Array:
+        """The poses `(n + 1, 4, 4)` of the world and of the arm's joints at `q (n,)`."""
+        pin.forwardKinematics(self._model, self._data, q)
+        return np.array([T.homogeneous for T in self._data.oMi])
+
+    def _place(self, q: Array) -> None:
+        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._placements, q)
+
+    def pair_distances(self, q: Array, pairs: Sequence[int]) -> list[float]:
+        """Signed distances [m] of some pairs, by index, at `q (n,)`."""
+        self._place(q)
+        geometry, data = self._geometry, self._placements
+        return [pin.computeDistance(geometry, data, i).min_distance for i in pairs]
+
+    def distances(self, q: Array) -> Array:
+        """Signed distances `(p,)` [m] of all pairs at `q (n,)`."""
+        self._place(q)
+        pin.computeDistances(self._geometry, self._placements)
+        return np.array([result.min_distance for result in self._placements.distanceResults])
+
+    def witness(self, q: Array, pair: int) -> PairDistance:
+        """A pair's distance and witness points, by its index, at `q (n,)`."""
+        self._place(q)
+        result = pin.computeDistance(self._geometry, self._placements, pair)
+        return PairDistance(
+            *self.names(pair),
+            float(result.min_distance),
+            np.array(result.getNearestPoint1()).ravel(),
+            np.array(result.getNearestPoint2()).ravel(),
+        )
+
+    def nearest(self, q: Array) -> PairDistance | None:
+        """The nearest pair of the whole robot at `q (n,)`; `None` if there is nothing to hit.
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+        """
+        q = self.kinematics.check_q(q)
+        if not len(self.pairs):
+            return None
+        return self.witness(q, int(np.argmin(self.distances(q))))
+
+    def too_close(self, q: Array, margin: float) -> tuple[str, str] | None:
+        """The nearest pair at `q (n,)` if it is nearer than the margin [m]."""
+        bounds = self.bounds
+        poses = self.joint_poses(q)
+        rough = bounds.rough_distances(poses[None, :, :3, :3], poses[None, :, :3, 3])[1][0]
+        near = [bounds.members[group] for group in np.flatnonzero(rough < margin)]
+        if not near:
+            return None
+        pairs = np.concatenate(near)
+        distances = self.pair_distances(q, pairs.tolist())
+        least = int(np.argmin(distances))
+        return self.names(int(pairs[least])) if distances[least] < margin else None
+
+    def tool_pairs(self) -> list[int]:
+        """The pairs, by index, of a tool body and what stands: the scene, and the robot's base."""
+        last = len(self.kinematics.spec.arm_joints)
+        return [
+            k
+            for k, (i, j) in enumerate(self.pairs)
+            if self.parts[i].joint == last and self.parts[j].joint == 0
+        ]
+
+    def tool_clearances(self, q: Array) -> list[PairDistance]:
+        """For each tool body the nearest that stands at `q (n,)`, the nearest pair first.
+
+        What stands is the scene's bodies and the robot's base.
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+        """
+        q = self.kinematics.check_q(q)
+        best: dict[str, tuple[float, int]] = {}
+        pairs = self.tool_pairs()
+        for k, distance in zip(pairs, self.pair_distances(q, pairs), strict=True):
+            body = self.parts[self.pairs[k][0]].body
+            if body not in best or distance < best[body][0]:
+                best[body] = distance, k
+        return sorted((self.witness(q, k) for _, k in best.values()), key=lambda d: d.distance)
+
+    def sphere_clearance(self, p: Array, radius: float) -> PairDistance | None:
+        """The nearest body of the scene to a bare sphere about `p (3,)` [m] in the world.
+
+        What the robot is made of is left out of account: a sphere that is clear says nothing of
+        the tool in it.
+        """
+        sphere, at = coal.Sphere(radius), coal.Transform3s(np.eye(3), np.asarray(p, float))
+        best: PairDistance | None = None
+        for part in self.parts:
+            if part.joint == 0 and part.body not in self._robot_bodies:
+                result = coal.DistanceResult()
+                distance = coal.distance(
+                    sphere, at, part.geometry, coal_transform(part.T_joint_part),
+                    coal.DistanceRequest(), result,
+                )  # fmt: skip
+                if best is None or distance < best.distance:
+                    points = (result.getNearestPoint1(), result.getNearestPoint2())
+                    best = PairDistance(
+                        "sphere", part.body, float(distance), *(np.ravel(x) for x in points)
+                    )
+        return best
+
+    @functools.cached_property
+    def _robot_bodies(self) -> frozenset[str]:
+        return frozenset(frame.name for frame in self._model.frames)
+
+    @functools.cached_property
+    def bounds(self) -> Bounds:
+        """What bounds the pairs' distances and motions from geometry alone."""
+        return Bounds(self)
+
+
+class Bounds:
+    """What bounds distances and motions of a model's pairs from geometry alone.
+
+    A group is all that one joint carries, against one body. Its parts are covered together by up
+    to four spheres, the body's parts enclosed in a box; one row for each sphere of each group.
+
+    Attributes:
+        members: for each group the pairs in it, by index.
+        starts: `(g,)` the first row of each group.
+        joint_a, joint_b: `(rows,)` the joints that carry sphere and box.
+        centres, radii: `(rows, 3)`, `(rows,)` spheres, in the frame of joint a [m].
+        R_box, p_box, half: `(rows, 3, 3)`, `(rows, 3)`, `(rows, 3)` boxes, in that of joint b [m].
+        reach: `(g, n)` no point of a group is ever farther [m] from a joint between it and the
+            body than this; 0 for other joints.
+        pair_a, pair_b: `(p,)` the joints that carry each pair's parts.
+        pair_centres, pair_radii: `(p, 3)`, `(p,)` one sphere about each pair's first part.
+        pair_R_box, pair_p_box, pair_half: `(p, 3, 3)`, `(p, 3)`, `(p, 3)` a box about its second.
+        pair_reach: `(p, n)` as `reach`.
+    """
+
+    def __init__(self, model: PlacedModel) -> None:
+        parts = model.parts
+        n = len(model.kinematics.spec.arm_joints)
+        grouped: dict[tuple[int, str], list[int]] = {}
+        for k, (i, j) in enumerate(model.pairs.tolist()):
+            grouped.setdefault((parts[i].joint, parts[j].body), []).append(k)
+        self.members: list[Index] = [np.array(pairs, np.intp) for pairs in grouped.values()]
+        joints = np.array([part.joint for part in parts], np.intp)
+        far = _axis_distances(model)
+        covers = {
+            joint: _sphere_cover(tuple(part for part in parts if part.joint == joint))
+            for joint in {joint for joint, _ in grouped}
+        }
+        boxes = {
+            body: _box([part for part in parts if part.body == body])
+            for body in {body for _, body in grouped}
+        }
+        counts = [len(covers[joint][1]) for joint, _ in grouped]
+        first, second = model.pairs[:, 0], model.pairs[:, 1]
+        self.pair_a, self.pair_b = joints[first], joints[second]
+        group_b = np.array([self.pair_b[pairs[0]] for pairs in self.members], np.intp)
+        self.starts: Index = np.array(np.cumsum([0, *counts])[:-1], np.intp)
+        self.joint_a: Index = np.repeat([joint for joint, _ in grouped], counts).astype(np.intp)
+        self.joint_b: Index = np.repeat(group_b, counts)
+        none: list[Array] = [np.zeros((0, 3))]
+        self.centres = np.concatenate([covers[joint][0] for joint, _ in grouped] or none)
+        self.radii = np.concatenate([covers[joint][1] for joint, _ in grouped] or [np.zeros(0)])
+        shape = (3, 3), (3,), (3,)
+        self.R_box, self.p_box, self.half = (
+            np.repeat(np.array([boxes[b][i] for _, b in grouped]).reshape(-1, *shape[i]), counts, 0)
+            for i in range(3)
+        )
+        # A chain is the joints from behind b up to a.
+        index = np.arange(n)
+        chain = (index >= self.pair_b[:, None]) & (index < self.pair_a[:, None])
+        self.pair_reach = np.where(chain, far[first], 0.0)
+        self.reach = np.array([self.pair_reach[pairs].max(0) for pairs in self.members])
+        self.reach = self.reach.reshape(-1, n)
+        self.pair_centres = np.array([part.sphere[0] for part in parts]).reshape(-1, 3)[first]
+        self.pair_radii = np.array([part.sphere[1] for part in parts])[first]
+        self.pair_R_box, self.pair_p_box, self.pair_half = (
+            np.array([part.box[i] for part in parts]).reshape(-1, *shape[i])[second]
+            for i in range(3)
+        )
+
+    def rough_distances(self, R: Array, p: Array) -> tuple[Array, Array]:
+        """Where the spheres are and how far groups are apart at least, without coal.
+
+        Args:
+            R, p: poses `(k, n + 1, 3, 3)`, `(k, n + 1, 3)` of the world and the arm's joints.
+
+        Returns:
+            Spheres' centres `(k, rows, 3)` in the world, and distances `(k, g)` [m] from below.
+        """
+        ja, jb = self.joint_a, self.joint_b
+        centre = np.einsum("krij,rj->kri", R[:, ja], self.centres) + p[:, ja]
+        local = np.einsum("krji,krj->kri", R[:, jb], centre - p[:, jb])
+        apart = _to_box(local, self.R_box, self.p_box, self.half) - self.radii
+        return centre, np.minimum.reduceat(apart, self.starts, axis=1)
+
+    def rough_pair_distances(self, centre: Array, R: Array, p: Array, pair: Index) -> Array:
+        """Distances `(k,)` [m] of pairs from below, without coal.
+
+        Args:
+            centre: of the spheres about the pairs' first parts, `(k, 3)` in the world.
+            R, p: poses `(k, 3, 3)`, `(k, 3)` of the joints that carry the pairs' second parts.
+            pair: `(k,)` pairs by index.
+        """
+        local = np.einsum("kji,kj->ki", R, centre - p)
+        boxes = self.pair_R_box[pair], self.pair_p_box[pair], self.pair_half[pair]
+        return _to_box(local, *boxes) - self.pair_radii[pair]
+
+
+def _to_box(points: Array, R_box: Array, p_box: Array, half: Array) -> Array:
+    """Distances `(...,)` [m] of points `(..., r, 3)` to boxes, a box each; 0 inside."""
+    local = np.einsum("rji,...rj->...ri", R_box, points - p_box)
+    out = np.maximum(np.abs(local) - half, 0.0)
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", out, out)))
+
+
+def _link_poses(model: RobotModel) -> dict[str, Array]:
+    """The pose `(4, 4)` of each frame on the joint that carries it."""
+    return {
+        frame.name: np.array(frame.placement.homogeneous) for frame in model.pinocchio_model.frames
+    }
+
+
+def _box(parts: Sequence[ConvexPart]) -> tuple[Array, Array, Array]:
+    """Axes `(3, 3)`, centre `(3,)` and half edges `(3,)` of a box about parts of one joint."""
+    R = parts[0].T_joint_part[:3, :3]
+    local = np.concatenate([part.points for part in parts]) @ R
+    low, high = local.min(0), local.max(0)
+    return R, R @ (low + high) / 2, (high - low) / 2
+
+
+@functools.lru_cache(maxsize=256)
+def _sphere_cover(parts: tuple[ConvexPart, ...]) -> tuple[Array, Array]:
+    """Centres `(k, 3)` and radii `(k,)` of up to four spheres about the hull of one joint's parts.
+
+    They are spheres about equal slices of the parts' box.
+    """
+    points = np.concatenate([part.points for part in parts])
+    middle = points.mean(0)
+    _, axes = np.linalg.eigh(np.cov((points - middle).T))
+    local = (points - middle) @ axes
+    low, high = local.min(0), local.max(0)
+    edges = high - low
+    longest = int(np.argmax(edges))
+    count = int(np.clip(round(edges[longest] / max(float(np.sort(edges)[1]), 1e-6)), 1, _SPHERES))
+    if count == 1:
+        centre = middle + axes @ (low + high) / 2
+        return centre[None], np.array([np.linalg.norm(points - centre, axis=1).max()])
+    half = edges / 2
+    half[longest] /= count
+    centres = np.tile((low + high) / 2, (count, 1))
+    centres[:, longest] = low[longest] + half[longest] * (2 * np.arange(count) + 1)
+    return middle + centres @ axes.T, np.full(count, np.linalg.norm(half))
+
+
+def _axis_distances(model: PlacedModel) -> Array:
+    """For each part and joint `(parts, n)`: how far [m] a point of the part can be from the joint.
+
+    That is in any configuration, for the joints that carry the part; 0 for others.
+    """
+    joints = model.kinematics.pinocchio_model.jointPlacements
+    distances = np.zeros((len(model.parts), len(joints) - 1))
+    links = [float(np.linalg.norm(T.translation)) for T in joints]
+    for row, part in zip(distances, model.parts, strict=True):
+        reach = part.reach
+        for j in range(part.joint, 0, -1):
+            row[j - 1] = reach
+            reach += links[j]
+    return distances
+
+
+def robot_parts(model: RobotModel) -> list[ConvexPart]:
+    """The convex parts of a robot's links and of what it holds, as its URDF has them.
+
+    Raises:
+        InvalidInput: a part is neither a mesh nor a box, sphere or cylinder.
+    """
+    pinocchio_model = model.pinocchio_model
+    loaded = pin.buildGeomFromUrdf(
+        pinocchio_model,
+        str(model.urdf),
+        pin.GeometryType.COLLISION,
+        package_dirs=str(model.urdf.parent),
+    )
+    parts = []
+    for item in loaded.geometryObjects:
+        geometry = item.geometry
+        if isinstance(geometry, coal.BVHModelBase):
+            geometry.buildConvexHull(True, "Qt")
+            geometry = geometry.convex
+        frame = pinocchio_model.frames[item.parentFrame]
+        T = np.array(item.placement.homogeneous)
+        points = _points(geometry) @ T[:3, :3].T + T[:3, 3]
+        parts.append(ConvexPart(frame.name, int(item.parentJoint), geometry, T, points))
+    return parts
+
+
+def _points(geometry: coal.CollisionGeometry) -> Array:
+    """Points `(n, 3)` whose convex hull encloses a convex geometry."""
+    if isinstance(geometry, coal.ConvexBase):
+        return np.array(geometry.points()).reshape(-1, 3)
+    return primitive(geometry).corners()
+
+
+def primitive(geometry: coal.CollisionGeometry) -> Shape:
+    """A box, sphere or cylinder of a URDF as a shape at its body's origin.
+
+    Raises:
+        InvalidInput: it is none of these.
+    """
+    if isinstance(geometry, coal.Box):
+        x, y, z = (2 * float(half) for half in geometry.halfSide)
+        return Shape("box", (x, y, z))
+    if isinstance(geometry, coal.Sphere):
+        return Shape("sphere", (float(geometry.radius),))
+    if isinstance(geometry, coal.Cylinder):
+        return Shape("cylinder", (float(geometry.radius), 2 * float(geometry.halfLength)))
+    raise InvalidInput(
+        f"geometry {type(geometry).__name__} is neither a mesh nor a box, sphere or cylinder; use "
+        "these in the URDF"
+    )
+
+
+def coal_geometry(shape: Shape) -> coal.CollisionGeometry:
+    """A shape as coal takes it, at its own origin."""
+    if shape.kind == "box":
+        return coal.Box(*shape.size)
+    if shape.kind == "sphere":
+        return coal.Sphere(*shape.size)
+    return coal.Cylinder(*shape.size)
+
+
+def coal_transform(T: Array) -> coal.Transform3s:
+    """A pose `(4, 4)` as coal takes it."""
+    return coal.Transform3s(T[:3, :3], T[:3, 3])
+
+
+def convex_distance(
+    a: coal.CollisionGeometry,
+    T_a: coal.Transform3s,
+    b: coal.CollisionGeometry,
+    T_b: coal.Transform3s,
+) -> float:
+    """The distance [m] between two convex geometries; negative where they overlap."""
+    # A result that is not new keeps the smallest distance it has seen.
+    result = coal.DistanceResult()
+    return float(coal.distance(a, T_a, b, T_b, coal.DistanceRequest(), result))
