@@ -404,12 +404,12 @@ class Episode:
 
     steps: Steps
     provenance: Provenance
-    joint_path: Array
+    joint_path: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:
         n = self.steps.joint_positions.shape[1]
-        path = check_array("joint_path", self.joint_path, (None, n))
-        object.__setattr__(self, "joint_path", frozen(path))
+        path = self.joint_path if len(self.joint_path) else np.empty((0, n))
+        object.__setattr__(self, "joint_path", frozen(check_array("joint_path", path, (None, n))))
 
     def __len__(self) -> int:
         return len(self.steps)

@@ -497,6 +497,21 @@ def episode_name(sphere: int, k: int) -> str:
     return f"sphere{sphere:02d}_k{k:05d}.h5"
 
 
+def load_dataset_info(path: Path) -> dict[str, Any]:
+    """What `dataset.json` says in a directory that `sart augment` made.
+
+    Raises:
+        MissingFile: no such directory, or it holds no dataset.
+        BrokenFile: generation was interrupted (run it again to resume), or the file is damaged.
+    """
+    path = Path(path)
+    if not os.path.isdir(path):
+        raise MissingFile(f"{path}: no such dataset directory; make it with `sart augment`")
+    if not (path / "dataset.json").exists() and (path / "attempts.jsonl").exists():
+        raise BrokenFile(f"{path}: generation was interrupted; run `sart augment` again to resume")
+    return read_json(path / "dataset.json")
+
+
 def load_dataset(path: Path) -> Dataset:
     """The dataset in a directory that `sart augment` made, whole.
 
@@ -506,11 +521,7 @@ def load_dataset(path: Path) -> Dataset:
         Mismatch: the annotation or an episode belongs to another demonstration.
     """
     path = Path(path)
-    if not os.path.isdir(path):
-        raise MissingFile(f"{path}: no such dataset directory; make it with `sart augment`")
-    if not (path / "dataset.json").exists() and (path / "attempts.jsonl").exists():
-        raise BrokenFile(f"{path}: generation was interrupted; run `sart augment` again to resume")
-    info = read_json(path / "dataset.json")
+    info = load_dataset_info(path)
     demonstration = load_demonstration(path / "demo.h5")
     annotation = load_annotation(path / "annotation.json")
     annotation.check_matches(demonstration)

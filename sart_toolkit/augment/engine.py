@@ -241,10 +241,14 @@ def _finish(
         "n_kept": len(kept),
         "n_attempted": len(outcomes),
         "rejections": dict(sorted(reasons.items())),
-        "spheres": [
+        "by_sphere": [
             _tally(sphere.waypoint, [o for (s, _), o in outcomes.items() if s == i])
             for i, sphere in enumerate(annotation.spheres)
         ],
+        "least_clearance_m": min(
+            float((episode.provenance.certificate or {})["commanded"]["clearance"])
+            for episode in episodes
+        ),
         "seconds": seconds,
         "simulated_seconds": len(outcomes) * request["config"]["duration"],
         "config": request["config"],

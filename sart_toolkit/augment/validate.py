@@ -28,7 +28,12 @@ from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scene.certificate import Certificate, certify
 from sart_toolkit.scene.collision import PlacedModel
 from sart_toolkit.scene.spec import SceneSpec
-from sart_toolkit.storage import load_annotation, load_demonstration, load_episode, read_json
+from sart_toolkit.storage import (
+    load_annotation,
+    load_dataset_info,
+    load_demonstration,
+    load_episode,
+)
 
 # Distances are good to coal's tolerance, and stored in whole micrometres.
 _LENGTH_TOLERANCE = 5e-6
@@ -73,11 +78,12 @@ def validate_dataset(
 
     Raises:
         MissingFile: a file of the dataset isn't there.
-        BrokenFile: demonstration, annotation or `dataset.json` can't be read.
+        BrokenFile: generation was interrupted, or demonstration, annotation or `dataset.json`
+            can't be read.
         Mismatch: the annotation belongs to another demonstration.
     """
     path = Path(path)
-    info = read_json(path / "dataset.json")
+    info = load_dataset_info(path)
     demonstration = load_demonstration(path / "demo.h5")
     annotation = load_annotation(path / "annotation.json")
     annotation.check_matches(demonstration)

@@ -273,6 +273,52 @@ class BenchmarkReplay:
 
 
 @dataclass(frozen=True)
+class BenchmarkSegments:
+    """How augmentation's segments fare: kept, touched, off their path, beyond the joints' limits.
+
+    On each task and backend a demonstration is recorded, spheres are suggested, and segments are
+    tried from them in turn, without pictures.
+
+    Example: sart benchmark segments --tasks all --backends pybullet --count 10000
+        --out segments.json
+
+    Interrupted, it goes on where it was when the same command is typed again.
+    """
+
+    tasks: _TASKS = "all"
+    backends: _BACKENDS = "all"
+    count: Annotated[int, arg(help="Segments to try, shared by tasks and backends.")] = 10_000
+    seed: _SEED = 0
+    out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_segments.json")
+    workers: _WORKERS = 2
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class BenchmarkRadii:
+    """Whether suggested radii are safe and tight, and how long suggesting them takes.
+
+    Safe: random poses in each sphere are free of collisions of the whole robot. Tight: with 15 %
+    more, draws that aim at the pair of bodies which limits a sphere find one.
+
+    Example: sart benchmark radii --tasks all --draws 2000 --directed 20000 --out radii.json
+
+    Interrupted, it goes on where it was when the same command is typed again.
+    """
+
+    tasks: _TASKS = "all"
+    backends: _BACKENDS = "pybullet"
+    draws: Annotated[int, arg(help="Random poses in each sphere.")] = 2000
+    directed: Annotated[int, arg(help="Draws that aim, in each grown sphere.")] = 20_000
+    seed: _SEED = 0
+    out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_radii.json")
+    workers: _WORKERS = 2
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
 class BenchmarkSkill:
     """How well a skill learned from one demonstration does, on each task and backend.
 
@@ -334,9 +380,12 @@ Verb = (
     | Annotated[
         Annotated[BenchmarkOperator, tyro.conf.subcommand("operator")]
         | Annotated[BenchmarkReplay, tyro.conf.subcommand("replay")]
+        | Annotated[BenchmarkSegments, tyro.conf.subcommand("segments")]
+        | Annotated[BenchmarkRadii, tyro.conf.subcommand("radii")]
         | Annotated[BenchmarkSkill, tyro.conf.subcommand("skill")],
         tyro.conf.subcommand(
-            "benchmark", description="Measure operator, backends or skills over many tasks."
+            "benchmark",
+            description="Measure operator, backends, motions or skills over many tasks.",
         ),
     ]
     | Annotated[Info, tyro.conf.subcommand("info")]

@@ -25,7 +25,9 @@ from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.cli.arguments import (
     Augment,
     BenchmarkOperator,
+    BenchmarkRadii,
     BenchmarkReplay,
+    BenchmarkSegments,
     BenchmarkSkill,
     Evaluate,
     Info,
@@ -43,6 +45,12 @@ from sart_toolkit.evaluate.benchmark import (
     benchmark_operator,
     benchmark_replay,
 )
+from sart_toolkit.evaluate.motions import (
+    RadiiConfig,
+    SegmentsConfig,
+    benchmark_radii,
+    benchmark_segments,
+)
 from sart_toolkit.evaluate.report import write_report
 from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
 from sart_toolkit.learn.skill import load_skill, save_skill
@@ -58,6 +66,7 @@ from sart_toolkit.storage import (
     clear_directory,
     load_annotation,
     load_dataset,
+    load_dataset_info,
     load_demonstration,
     load_episode,
     read_json,
@@ -76,6 +85,7 @@ from sart_toolkit.teach.suggest import (
     Surroundings,
     suggest_annotation,
 )
+from sart_toolkit.testing.closest import ClosestPoints
 
 Result = dict[str, Any]
 
@@ -209,6 +219,7 @@ def augment_verb(args: Augment) -> Result:
 
 def validate_verb(args: Validate) -> Result:
     """`sart validate`."""
+    load_dataset_info(args.dataset)
     demonstration = load_demonstration(args.dataset / "demo.h5")
     task = get_task(demonstration.task)
     with progress_bar("validate", None, "episode") as bar:
@@ -425,6 +436,59 @@ def benchmark_replay_verb(args: BenchmarkReplay) -> Result:
     }
 
 
+def benchmark_segments_verb(args: BenchmarkSegments) -> Result:
+    """`sart benchmark segments`."""
+    cells = _cells(args.tasks, args.backends)
+    config = SegmentsConfig(args.count, args.seed)
+    with progress_bar("segments", args.count, "segment") as bar:
+
+        def progress(done: int, wanted: int, kept: int) -> None:
+            bar.set_postfix_str(f"{kept}/{done} kept", refresh=False)
+            bar.update(done - bar.n)
+
+        result = benchmark_segments(
+            cells, config, args.out, args.workers, args.overwrite, progress, _about()
+        )
+
+    def line(row: Result) -> str:
+        low, high = (100 * end for end in row["ci95"])
+        return (
+            f"{row['kept']}/{row['attempted']} kept (95 % interval {low:.1f} to {high:.1f} %), "
+            f"{row['contacts']} contacts, {row['left_path']} off their path, "
+            f"{row['limits']['motions_that_violate']} beyond limits"
+        )
+
+    return {"benchmark": str(args.out)} | {
+        name: line(row) for name, row in [*result["cells"].items(), ("all", result["total"])]
+    }
+
+
+def benchmark_radii_verb(args: BenchmarkRadii) -> Result:
+    """`sart benchmark radii`."""
+    cells = _cells(args.tasks, args.backends)
+    config = RadiiConfig(args.draws, args.directed, seed=args.seed)
+    with progress_bar("radii", len(cells), "task") as bar:
+
+        def progress(done: int, wanted: int) -> None:
+            bar.update(done - bar.n)
+
+        result = benchmark_radii(
+            cells, ClosestPoints, config, args.out, args.workers, args.overwrite, progress, _about()
+        )
+    return {"benchmark": str(args.out)} | {
+        name: (
+            f"{row['n_collisions']} collisions in {row['n_draws']} draws from {row['n_spheres']} "
+            f"spheres; grown, {row['n_collided_when_grown']} of {row['n_limited_by_pair']} collide"
+        )
+        for name, row in [*result["cells"].items(), ("all", result["total"])]
+    }
+
+
+def _about() -> Result:
+    """What a benchmark's figures depend on, besides what is in its own config."""
+    return {"command": shlex.join(["sart", *sys.argv[1:]]), "machine": doctor.machine()}
+
+
 def benchmark_skill_verb(args: BenchmarkSkill) -> Result:
     """`sart benchmark skill`: one `sart run` after the other, then their figures."""
     rows: Result = {}
@@ -551,6 +615,8 @@ _VERBS: dict[type, Callable[[Any], Result]] = {
     Evaluate: evaluate_verb,
     BenchmarkOperator: benchmark_operator_verb,
     BenchmarkReplay: benchmark_replay_verb,
+    BenchmarkSegments: benchmark_segments_verb,
+    BenchmarkRadii: benchmark_radii_verb,
     BenchmarkSkill: benchmark_skill_verb,
     Info: info_verb,
 }

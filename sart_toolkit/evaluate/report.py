@@ -413,12 +413,14 @@ def _augmentation_section(run: _Run) -> Markup:
     seconds = float(_field(info, file, "seconds"))
     rate = f", {kept / seconds:.1f} kept each second" if seconds > 0 else ""
     share = f" ({percent(kept / attempted)})" if attempted else ""
+    clear = info.get("least_clearance_m")
     parts = [
         element(
             "p",
             element("strong", f"{kept} of {attempted}"),
-            f" attempted trajectories were kept{share}, in {duration(seconds)}{rate}. A trajectory "
-            "in which anything touched is rejected.",
+            f" attempted trajectories were kept{share}, in {duration(seconds)}{rate}. Each was proved "
+            "to stay clear before the robot moved, and again as it was measured"
+            + (f": by at least {_millimetres(float(clear))}." if clear else "."),
         )
     ]
     total = max(attempted, 1)

@@ -13,7 +13,7 @@ from sart_toolkit.poses import Array, check_pose, check_positive, distance, inte
 from sart_toolkit.robots.model import RobotModel
 
 # The number of knots is doubled until the tool's deviation is within bounds.
-_FEWEST, _MOST = 13, 200
+_FEWEST, _MANY, _MOST = 13, 49, 200
 
 
 def straight_line(
@@ -49,7 +49,12 @@ def straight_line(
     check_positive("deviation", deviation, "m")
     T_at = functools.partial(interpolate, start, end)
     count = _FEWEST
-    knots = _solutions(model, q_start, T_at, np.linspace(0.0, 1.0, count), max_joint_step)
+    try:
+        knots = _solutions(model, q_start, T_at, np.linspace(0.0, 1.0, count), max_joint_step)
+    except MotionRejected:
+        # A joint that turns quickly may only seem to jump.
+        count = _MANY
+        knots = _solutions(model, q_start, T_at, np.linspace(0.0, 1.0, count), max_joint_step)
     while True:
         path = SplinePath.through(knots)
         middles = (np.arange(count - 1) + 0.5) / (count - 1)

@@ -31,7 +31,7 @@ _DEGREE = 5
 # Control points of the smooth path. The fewest make the smoothest; the most follow its corners.
 _CONTROL_POINTS = (8, 11, 15, 20, 27, 36, 48, 64, 86, 115, 154)
 # Distances that may be computed for one edge; some 200 settle most.
-_EDGE_CHECKS = 1500
+_EDGE_CHECKS = 1000
 # How near to a joint limit [rad] a path may be planned.
 _FROM_LIMIT = 0.01
 # Another branch of the arm has some joint farther from the start than this [rad].
@@ -77,7 +77,7 @@ def check_planner() -> None:
         MissingExtra: it isn't.
     """
     try:
-        import ompl.geometric  # noqa: F401
+        from ompl import geometric  # noqa: F401
     except ImportError as error:
         raise MissingExtra(
             f"planning needs OMPL ({error}); pip install 'sart_toolkit[planning]'"

@@ -33,7 +33,7 @@ from sart_toolkit.robots.spec import (
 )
 
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 10
+_RECIPE = 11
 _ARM_FACES, _GRIPPER_FACES = 150, 300
 _GRIPPER_PREFIX = "gripper_"
 
@@ -50,7 +50,8 @@ def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
     Raises:
         MissingExtra, MissingFile: a source URDF isn't there.
         BrokenFile: a source URDF can't be parsed.
-        InvalidInput: two links or joints have the same name.
+        InvalidInput: two links or joints have the same name, a link is drawn but has no collision
+            shape, or a collision mesh isn't that of a solid.
     """
     sources = [resource_path(spec.urdf), resource_path(spec.gripper.urdf)]
     attachments = [*spec.attachments, *held]
@@ -145,6 +146,15 @@ def _compose(
         if link.find("inertial") is None:
             # A simulator would give a link without inertia one kilogram.
             link.append(_inertial(1e-3, np.zeros(3), 1e-6 * np.eye(3)))
+    added = {body.name for body in attachments}
+    for link in robot.findall("link"):
+        # Of what is attached the shapes say themselves which of them collide.
+        drawn = link.find("visual") is not None and link.get("name") not in added
+        if drawn and link.find("collision") is None:
+            raise InvalidInput(
+                f"link {link.get('name')!r}: is drawn but has no collision shape, so nothing can be "
+                "proved about it; give it one in the URDF"
+            )
     ET.indent(robot)
     ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)
 
@@ -210,6 +220,7 @@ def _lighten(link: ET.Element, base: Path, work: Path, spec: RobotSpec) -> None:
                 continue
             loaded = _loaded(mesh, base)
             if kind == "collision":
+                _check_solid(loaded, name, mesh.get("filename", ""))
                 light = loaded.convex_hull
             else:
                 light = _simplified(loaded, target, solids.get(_where(element)))
@@ -242,6 +253,30 @@ def _loaded(element: ET.Element, base: Path) -> trimesh.Trimesh:
     mesh.apply_scale(np.array([float(s) for s in element.get("scale", "1 1 1").split()]))
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh
+
+
+def _check_solid(mesh: trimesh.Trimesh, link: str, file: str) -> None:
+    """Return if a collision mesh bounds a solid, whose convex hull then encloses the link.
+
+    Raises:
+        InvalidInput: it has no faces, numbers that aren't finite, triangles without area, or holes.
+    """
+    what = f"link {link!r}: collision mesh {Path(file).name}"
+    if not len(mesh.faces):
+        raise InvalidInput(f"{what} has no triangles; export it again")
+    if not np.isfinite(mesh.vertices).all():
+        raise InvalidInput(f"{what} has NaN or infinite vertices; export it again")
+    flat = int((~mesh.nondegenerate_faces()).sum())
+    if flat:
+        raise InvalidInput(
+            f"{what} has {flat} degenerate triangles (no area); remove them, for instance with "
+            "trimesh's update_faces(nondegenerate_faces())"
+        )
+    if not mesh.is_watertight:
+        raise InvalidInput(
+            f"{what} isn't watertight, so a part of the link may be missing; close its holes, or "
+            "use boxes, cylinders and spheres"
+        )
 
 
 def _simplified(

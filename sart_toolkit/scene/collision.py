@@ -441,14 +441,14 @@ class Bounds:
         return centre, np.minimum.reduceat(apart, self.starts, axis=1)
 
     def rough_pair_distances(self, centre: Array, R: Array, p: Array, pair: Index) -> Array:
-        """Distances `(k,)` [m] of pairs from below, without coal.
+        """Distances `(..., k)` [m] of pairs from below, without coal.
 
         Args:
-            centre: of the spheres about the pairs' first parts, `(k, 3)` in the world.
-            R, p: poses `(k, 3, 3)`, `(k, 3)` of the joints that carry the pairs' second parts.
+            centre: of the spheres about the pairs' first parts, `(..., k, 3)` in the world.
+            R, p: poses `(..., k, 3, 3)`, `(..., k, 3)` of the joints that carry the second parts.
             pair: `(k,)` pairs by index.
         """
-        local = np.einsum("kji,kj->ki", R, centre - p)
+        local = np.einsum("...ji,...j->...i", R, centre - p)
         boxes = self.pair_R_box[pair], self.pair_p_box[pair], self.pair_half[pair]
         return _to_box(local, *boxes) - self.pair_radii[pair]
 

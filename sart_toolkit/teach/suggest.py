@@ -29,7 +29,7 @@ _SHRINK = 0.9
 # smallest singular value (metres and radians alike) no less: elsewhere small motions of the tool
 # take large ones of the joints.
 _JOINT_MARGIN = 0.05
-_LEAST_SINGULAR_VALUE = 0.05
+_LEAST_SINGULAR_VALUE = 0.03
 _LARGEST_STEP = 1.5
 # What moves no farther than this in 0.2 s stands still [m, deg].
 _STILL, _STILL_DEG = 0.0005, 0.2

@@ -210,9 +210,9 @@ def test_tries_that_would_touch_are_rejected_and_counted_by_what_touched(crowded
     info = crowded_dataset.info
     assert len(crowded_dataset.episodes) == info["n_kept"] == 4
     assert info["rejections"]["path too close peg / block"] > 0
-    for i, row in enumerate(info["spheres"]):
+    for i, row in enumerate(info["by_sphere"]):
         assert row["kept"] == sum(e.provenance.sphere == i for e in crowded_dataset.episodes)
-    total = sum((Counter(row["rejections"]) for row in info["spheres"]), Counter())
+    total = sum((Counter(row["rejections"]) for row in info["by_sphere"]), Counter())
     assert total == info["rejections"]
     assert all(isinstance(count, int) for count in info["rejections"].values())
     assert info["n_attempted"] == info["n_kept"] + sum(info["rejections"].values())
@@ -319,7 +319,11 @@ def test_an_episode_s_certificates_say_what_is_proved(peg_dataset):
         proof = episode.provenance.certificate
         assert proof["duration"] == 2.0
         assert proof["commanded"]["verdict"] == proof["measured"]["verdict"] == "free"
-        assert proof["commanded"]["clearance"] >= proof["commanded"]["margin"] == AugmentConfig().margin
+        assert (
+            proof["commanded"]["clearance"]
+            >= proof["commanded"]["margin"]
+            == AugmentConfig().margin
+        )
         assert 0 <= proof["deviation"] < 0.002
         assert len(episode.joint_path) == 1 + 2 * 240
 

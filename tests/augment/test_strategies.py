@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.strategies import (
     LAWS,
     STRATEGIES,
@@ -16,8 +18,9 @@ from sart_toolkit.augment.strategies import (
     sample_direction,
     sample_rotation,
     sart,
+    sart_planned,
 )
-from sart_toolkit.errors import InvalidInput, UnknownName
+from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
 from sart_toolkit.poses import angle_between, log_rotation, pose
 from sart_toolkit.records import Demonstration, PrecisionSphere, Steps, convergence_waypoint
 
@@ -183,7 +186,8 @@ def test_a_demonstration_that_never_leaves_a_sphere_is_joined_at_its_last_waypoi
 def test_every_strategy_rejoins_ahead_of_its_sphere_and_follows_from_the_rng(
     name, peg_demonstration, peg_annotation
 ):
-    strategy = get_strategy(name)
+    # Drawing needs no planner: `get_strategy` would ask for it.
+    strategy = STRATEGIES[name]
     for sphere in peg_annotation.spheres:
         drawn = [
             strategy(peg_demonstration, sphere, np.random.default_rng(3), SamplingConfig())
@@ -193,6 +197,67 @@ def test_every_strategy_rejoins_ahead_of_its_sphere_and_follows_from_the_rng(
         np.testing.assert_array_equal(drawn[0].T_world_sampled, drawn[1].T_world_sampled)
         with pytest.raises(ValueError, match="read-only"):
             drawn[0].T_world_sampled[0, 0] = 1.0
+
+
+# --- free-space regions -------------------------------------------------------------------------
+
+
+def _distances(region, law, n=3000):
+    demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
+    rng = np.random.default_rng(5)
+    drawn = [sart_planned(demonstration, region, rng, SamplingConfig(law)) for _ in range(n)]
+    offsets = np.array([d.T_world_sampled[:3, 3] for d in drawn]) - region.T_world_key[:3, 3]
+    turns = [angle_between(region.T_world_key[:3, :3], d.T_world_sampled[:3, :3]) for d in drawn]
+    return offsets, np.array(turns)
+
+
+def test_a_pose_in_a_free_space_region_is_drawn_from_its_volume(law):
+    region = PrecisionSphere(0, pose([0.3, 0.1, 0.2], [0.4, 0, 0]), 0.25, kind="free_space")
+    offsets, turns = _distances(region, law)
+    distances = np.linalg.norm(offsets, axis=1)
+    assert _fits((distances / 0.25) ** 3, stats.uniform(0, 1))
+    assert _fits(turns, stats.uniform(0, 2.0 * 0.25))
+    phi = np.arccos(offsets[:, 2] / distances)
+    assert _fits(phi, stats.uniform(0, np.pi)) == (law == "paper")
+    # By area the volume is filled evenly: an axis-parallel slab's share is its volume's.
+    inside = (np.abs(offsets[:, 2]) < 0.05).mean()
+    share = 0.5 * (3 * 0.2 - 0.2**3)
+    assert (abs(inside - share) < 0.03) == (law == "area")
+
+
+@pytest.mark.parametrize("kind", ["ball", "free_space"])
+def test_the_paper_s_strategy_draws_from_the_surface_of_a_sphere_of_either_kind(kind):
+    demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
+    sphere = PrecisionSphere(0, pose([0.1, 0, 0]), 0.25, kind=kind)
+    T = sart(demonstration, sphere, np.random.default_rng(1), SamplingConfig()).T_world_sampled
+    assert np.linalg.norm(T[:3, 3] - [0.1, 0, 0]) == pytest.approx(0.25, abs=1e-12)
+
+
+def test_in_a_ball_the_strategy_that_plans_draws_what_the_paper_s_does(law):
+    demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
+    sphere, config = PrecisionSphere(0, pose([0.1, 0, 0]), 0.2), SamplingConfig(law)
+    for seed in range(5):
+        a, b = (
+            f(demonstration, sphere, np.random.default_rng(seed), config)
+            for f in (sart, sart_planned)
+        )
+        assert a.t_star == b.t_star
+        np.testing.assert_array_equal(a.T_world_sampled, b.T_world_sampled)
+
+
+def test_only_the_planned_strategy_plans_and_either_may_be_called():
+    assert {name: strategy.plans for name, strategy in STRATEGIES.items()} == {
+        "sart": False,
+        "sart_planned": True,
+    }
+    demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
+    sphere = PrecisionSphere(0, pose(), 0.2)
+    for strategy in STRATEGIES.values():
+        arguments = demonstration, sphere, np.random.default_rng(0), SamplingConfig()
+        again = demonstration, sphere, np.random.default_rng(0), SamplingConfig()
+        np.testing.assert_array_equal(
+            strategy(*arguments).T_world_sampled, strategy.propose(*again).T_world_sampled
+        )
 
 
 # --- errors -------------------------------------------------------------------------------------
@@ -213,3 +278,11 @@ def test_a_rotation_per_metre_that_is_no_angle_is_refused(value):
     with pytest.raises(InvalidInput, match="rotation_per_metre: expected a finite number >= 0"):
         SamplingConfig(rotation_per_metre=value)
     assert dataclasses.replace(SamplingConfig(), rotation_per_metre=0.0).rotation_per_metre == 0
+
+
+def test_without_ompl_a_strategy_that_plans_is_refused_at_once_and_the_other_is_not(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    for ask in (get_strategy, lambda name: AugmentConfig(strategy=name)):
+        ask("sart")
+        with pytest.raises(MissingExtra, match=r"pip install 'sart_toolkit\[planning\]'"):
+            ask("sart_planned")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -113,12 +114,49 @@ def test_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
     for argv in (
         ["suggest", nowhere, "--out", tmp_path / "a.json"],
         ["augment", nowhere, nowhere, "--out", tmp_path / "d"],
+        ["validate", nowhere],
         ["train", nowhere, "--out", tmp_path / "s"],
         ["evaluate", nowhere, "--out", tmp_path / "e.json"],
         ["info", nowhere],
     ):
         assert "nowhere.h5: no such" in error(capsys, *argv)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_validate_proves_a_dataset_again_and_names_what_does_not_hold(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = run(capsys, "validate", chain / "data")
+    assert found["episodes"] == 4
+    assert 0 < found["least_clearance_mm"] < 100
+    assert 0 < found["largest_deviation_mm"] < 5
+    broken = shutil.copytree(chain / "data", tmp_path / "data")
+    episode = sorted((broken / "episodes").iterdir())[0]
+    episode.write_bytes(episode.read_bytes()[:2000])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        main(["validate", str(broken)])
+    assert exit_.value.code == 2
+    said = capsys.readouterr().err
+    assert f"{episode.name}: " in said and "truncated" in said
+    assert "1 of 4 episodes don't hold; generate them again" in said
+    (broken / "dataset.json").unlink()
+    assert "generation was interrupted" in error(capsys, "validate", broken)
+
+
+def test_radii_are_suggested_from_the_recorded_pictures_alone(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["suggest", chain / "demo.h5", "--source", "cloud"]
+    behind = run(capsys, *argv, "--out", tmp_path / "behind.json")["spheres"]
+    free = run(capsys, *argv, "--out", tmp_path / "free.json", "--unknown", "free")["spheres"]
+    assert all("cloud" in sphere["limited_by"] for sphere in behind)
+    assert len(free) >= len(behind) >= 1
+    run(
+        capsys, "augment", chain / "demo.h5", tmp_path / "behind.json", "--out", tmp_path / "d",
+        "--n", 3,
+    )  # fmt: skip
+    assert run(capsys, "validate", tmp_path / "d")["episodes"] == 2
 
 
 def test_truncated_demonstration_is_refused_and_nothing_replaced(
@@ -164,7 +202,7 @@ def test_poses_out_of_reach_are_counted_and_end_in_an_error(
     edited = tmp_path / "edited.json"
     edited.write_text(json.dumps(value))
     said = error(capsys, "augment", chain / "demo.h5", edited, "--out", tmp_path / "d", "--n", 2)
-    assert "none of 20 tries" in said and "out of reach: 1" in said and "smaller radii" in said
+    assert "none of 20 tries" in said and "out of reach: 20" in said and "smaller radii" in said
 
 
 def test_unknown_names_offer_the_nearest_and_leave_nothing(

@@ -317,3 +317,50 @@ def test_two_joints_of_one_name_are_refused(make_tiny):
     composed_urdf(make_tiny(), (held, clash))
     with pytest.raises(InvalidInput, match="two links are called 'peg'"):
         composed_urdf(make_tiny(), (held, held))
+
+
+def _broken(kind):
+    """A box as a mesh that bounds no solid."""
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1))
+    if kind == "open":
+        mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    elif kind == "flat":
+        mesh.faces = np.concatenate([mesh.faces, [[0, 1, 1]]])
+    elif kind == "nan":
+        mesh.vertices[0] = np.nan
+    elif kind == "empty":
+        mesh.update_faces(np.zeros(len(mesh.faces), bool))
+    return mesh
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("open", "link 'base_link': collision mesh part.stl isn't watertight, .* close its holes"),
+        ("flat", r"collision mesh part.stl has \d+ degenerate triangles \(no area\); remove them"),
+        ("nan", "collision mesh part.stl has NaN or infinite vertices"),
+        ("empty", "collision mesh part.stl has no triangles"),
+    ],
+)
+def test_a_collision_mesh_that_bounds_no_solid_is_refused(
+    make_tiny, own_cache, tmp_path, monkeypatch, kind, message
+):
+    spec = make_tiny()
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(
+        urdf.read_text().replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="part.stl"/>', 1)
+    )
+    (tmp_path / "part.stl").write_bytes(trimesh.creation.box().export(file_type="stl"))
+    # As read: an exporter would mend or refuse some of these.
+    monkeypatch.setattr(urdf_module, "_loaded", lambda *_: _broken(kind))
+    with pytest.raises(InvalidInput, match=message):
+        composed_urdf(spec)
+    assert not list(own_cache.rglob("robot.urdf"))
+
+
+def test_a_link_that_is_drawn_but_does_not_collide_is_refused(make_tiny, tmp_path):
+    spec = make_tiny()
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(urdf.read_text().replace("collision>", "visual>", 2))
+    with pytest.raises(InvalidInput, match="link 'base_link': is drawn but has no collision shape"):
+        composed_urdf(spec)

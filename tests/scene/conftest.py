@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from sart_toolkit.poses import Array
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scene.collision import CollisionModel, PlacedModel
-from sart_toolkit.scene.spec import Body, SceneSpec, SceneState
+from sart_toolkit.scene.spec import SceneSpec, SceneState
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.testing.clutter import CLUTTER
 
@@ -32,32 +31,38 @@ def start(peg_task: Task, peg_model: RobotModel) -> Start:
     return Start(collision, collision.placed(state.Ts_world_body, state.gripper), state)
 
 
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(3)
+
+
+class Cluttered(NamedTuple):
+    """A robot's name, a scene of clutter around it, how far its gripper is closed."""
+
+    robot: str
+    scene: SceneSpec
+    gripper: float
+
+    @property
+    def Ts_world_body(self) -> dict[str, Array]:
+        """Where the scene has its bodies."""
+        return {body.name: body.T_world_body for body in self.scene.bodies}
+
+
 @pytest.fixture(scope="session")
-def among() -> Callable[..., PlacedModel]:
-    """Makes a robot among bodies that stand where they are said to, but for what it carries."""
-
-    def make(
-        *bodies: Body,
-        robot: str = "ur5e_2f85",
-        gripper: float = 0.0,
-        carried: dict[str, Array] | None = None,
-        allowed: tuple[tuple[str, str], ...] = (),
-    ) -> PlacedModel:
-        Ts = {body.name: body.T_world_body for body in bodies}
-        collision = CollisionModel(get_robot(robot), SceneSpec(bodies))
-        return collision.placed(Ts, gripper, carried, allowed)
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def cluttered() -> dict[str, PlacedModel]:
-    """A robot in a scene of each kind of clutter."""
+def clutter() -> dict[str, Cluttered]:
+    """A scene of each kind of clutter."""
     rng = np.random.default_rng(7)
-    found = {}
-    for i, (kind, make) in enumerate(CLUTTER.items()):
-        scene = make(rng)
-        collision = CollisionModel(get_robot(("ur5e_2f85", "ur5e_hande")[i % 2]), scene)
-        Ts = {body.name: body.T_world_body for body in scene.bodies}
-        found[kind] = collision.placed(Ts, float(rng.uniform()))
-    return found
+    return {
+        kind: Cluttered(("ur5e_2f85", "ur5e_hande")[i % 2], make(rng), float(rng.uniform()))
+        for i, (kind, make) in enumerate(CLUTTER.items())
+    }
+
+
+@pytest.fixture(scope="session")
+def cluttered(clutter: dict[str, Cluttered]) -> dict[str, PlacedModel]:
+    """Robot and scene of each kind of clutter."""
+    return {
+        kind: CollisionModel(get_robot(it.robot), it.scene).placed(it.Ts_world_body, it.gripper)
+        for kind, it in clutter.items()
+    }

@@ -16,7 +16,6 @@ from sart_toolkit.poses import inverse, pose
 from sart_toolkit.records import CameraRecord
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.scene.collision import coal_transform, convex_distance, robot_parts
 from sart_toolkit.scene.cloud import (
     CarriedObject,
     CloudConfig,
@@ -27,6 +26,7 @@ from sart_toolkit.scene.cloud import (
     hull_part,
     surface_errors,
 )
+from sart_toolkit.scene.collision import coal_transform, convex_distance, robot_parts
 from sart_toolkit.scene.spec import Body, SceneSpec
 
 FLOOR = -0.20

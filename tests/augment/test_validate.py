@@ -1,0 +1,177 @@
+"""A dataset that was tampered with is told, whatever was changed in it."""
+
+import dataclasses
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
+from sart_toolkit.augment.validate import validate_dataset
+from sart_toolkit.errors import BrokenFile, Mismatch, MissingFile
+from sart_toolkit.records import Steps
+from sart_toolkit.storage import load_dataset, load_episode, save_episode
+
+
+@pytest.fixture(scope="module")
+def made(peg_demonstration, peg_annotation, make_peg_backend, tmp_path_factory):
+    out = tmp_path_factory.mktemp("validate") / "dataset"
+    augment_demonstration(
+        peg_demonstration, peg_annotation, make_peg_backend, out, AugmentConfig(n=4)
+    )
+    return out
+
+
+@pytest.fixture
+def copy(made, tmp_path):
+    return shutil.copytree(made, tmp_path / "dataset")
+
+
+@pytest.fixture
+def validate(peg_model, peg_task):
+    return lambda path, **options: validate_dataset(path, peg_model.spec, peg_task.scene, **options)
+
+
+def change(path, index=0, **changes):
+    """Change an episode and write it with hashes that fit."""
+    info = json.loads((path / "dataset.json").read_text())
+    file = path / "episodes" / info["episodes"][index]
+    episode = load_episode(file)
+    save_episode(file, dataclasses.replace(episode, **changes))
+    return file.name, episode
+
+
+def with_steps(episode, **changes):
+    fields = {f.name: getattr(episode.steps, f.name) for f in dataclasses.fields(Steps)}
+    return Steps(**{**fields, **changes})
+
+
+def test_what_was_generated_holds(made, validate):
+    seen = []
+    found = validate(made, progress=lambda done, wanted: seen.append((done, wanted)))
+    assert not found.problems
+    assert found.episodes == 3 and seen == [(1, 3), (2, 3), (3, 3)]
+    proofs = [e.provenance.certificate for e in load_dataset(made).episodes]
+    stated = min(min(p["commanded"]["clearance"], p["measured"]["clearance"]) for p in proofs)
+    assert found.least_clearance == pytest.approx(stated, abs=2e-6)
+    assert found.largest_deviation == pytest.approx(max(p["deviation"] for p in proofs), abs=2e-6)
+
+
+def test_a_truncated_episode_and_a_missing_one_are_told_and_the_others_still_checked(
+    copy, validate
+):
+    files = sorted((copy / "episodes").iterdir())
+    files[0].write_bytes(files[0].read_bytes()[:3000])
+    files[1].unlink()
+    found = validate(copy)
+    assert set(found.problems) == {files[0].name, files[1].name}
+    assert "truncated or not a episode" in found.problems[files[0].name]
+    assert "no such file" in found.problems[files[1].name]
+
+
+def test_a_flipped_bit_is_told_by_the_hash(copy, validate):
+    file = sorted((copy / "episodes").iterdir())[0]
+    content = bytearray(file.read_bytes())
+    at = content.find(load_episode(file).joint_path.tobytes())
+    content[at + 800] ^= 1
+    file.write_bytes(content)
+    assert "content differs from its hash" in validate(copy).problems[file.name]
+
+
+def test_an_episode_exchanged_for_a_good_one_is_told_by_the_dataset_s_hash(copy, validate):
+    files = sorted((copy / "episodes").iterdir())
+    shutil.copy(files[0], files[1])
+    assert "dataset.json" in validate(copy).problems
+
+
+def provenance(**changes):
+    return lambda episode: {"provenance": dataclasses.replace(episode.provenance, **changes)}
+
+
+def certificate(which, **changes):
+    def change(episode):
+        proof = episode.provenance.certificate
+        return provenance(certificate={**proof, which: {**proof[which], **changes}})(episode)
+
+    return change
+
+
+def moved_path(episode):
+    path = np.array(episode.joint_path)
+    path[200:240] += 0.01
+    return {"joint_path": path}
+
+
+def folded_path(episode):
+    path = np.array(episode.joint_path)
+    path[200] = [0.0, 0.3, 2.6, 0.0, 0.0, 0.0]
+    return {"joint_path": path}
+
+
+def steps(**changes):
+    return lambda episode: {
+        "steps": with_steps(
+            episode, **{k: v(getattr(episode.steps, k)) for k, v in changes.items()}
+        )
+    }
+
+
+@pytest.mark.parametrize(
+    ("tamper", "message"),
+    [
+        (provenance(k=17), "seed, sphere and k lead to another pose"),
+        (provenance(seed=5), "another seed, strategy or law"),
+        (provenance(t_star=3), "lead to another pose or waypoint"),
+        (provenance(demonstration_hash="0" * 64), "belongs to another demonstration"),
+        (provenance(certificate=None), "certificate: there is none"),
+        (certificate("commanded", clearance=0.2), "commanded path is proved .* 200.000 mm are"),
+        (certificate("measured", clearance=0.2), "measured path is proved .* 200.000 mm are"),
+        (certificate("commanded", verdict="collision"), "is free, collision is stated"),
+        (certificate("commanded", margin=0.0), "commanded path is proved"),
+        (certificate("commanded", nonsense=1), "certificate: a field is missing or unknown"),
+        (moved_path, r"measured path is (proved|\d+\.\d+ mm off)"),
+        (folded_path, "the measured path is collision, free is stated"),
+        (lambda e: {"joint_path": e.joint_path[::-1]}, "measured joints aren't the measured path"),
+        (steps(commanded_joint_positions=lambda q: q[::-1]), "commanded joints aren't the planned"),
+        (steps(commanded_Ts_world_tool=lambda T: T[::-1]), "commanded poses aren't the planned"),
+        (steps(measured_Ts_world_tool=lambda T: T[::-1]), "poses and joints don't belong together"),
+    ],
+)
+def test_whatever_is_changed_is_told_though_all_hashes_fit(copy, validate, tamper, message):
+    file = copy / "episodes" / json.loads((copy / "dataset.json").read_text())["episodes"][0]
+    name, _ = change(copy, **tamper(load_episode(file)))
+    # The dataset's own hash no longer fits either: the episode's problem is what is looked for.
+    assert re.search(message, validate(copy).problems[name])
+
+
+def test_an_episode_with_a_step_too_few_is_told(copy, validate):
+    info = json.loads((copy / "dataset.json").read_text())
+    episode = load_episode(copy / "episodes" / info["episodes"][0])
+    shorter = {
+        f.name: getattr(episode.steps, f.name)[1:]
+        for f in dataclasses.fields(Steps)
+        if f.name != "cameras"
+    }
+    name, _ = change(copy, steps=Steps(cameras={}, **shorter))
+    assert "reversal: 19 steps, the motion has 20" in validate(copy).problems[name]
+
+
+def test_what_is_no_dataset_is_refused(copy, validate, tmp_path):
+    with pytest.raises(MissingFile, match="dataset.json: no such file"):
+        validate(tmp_path)
+    info = json.loads((copy / "dataset.json").read_text())
+    del info["config"]
+    (copy / "dataset.json").write_text(json.dumps(info))
+    with pytest.raises(BrokenFile, match="'config' is missing or wrong; generate again"):
+        validate(copy)
+
+
+def test_an_annotation_of_another_demonstration_is_refused(copy, validate):
+    annotation = json.loads((copy / "annotation.json").read_text())
+    annotation["demonstration_hash"] = "0" * 64
+    (copy / "annotation.json").write_text(json.dumps(annotation))
+    with pytest.raises(Mismatch, match="made for another demonstration"):
+        validate(copy)
