@@ -418,8 +418,8 @@ def _augmentation_section(run: _Run) -> Markup:
         element(
             "p",
             element("strong", f"{kept} of {attempted}"),
-            f" attempted trajectories were kept{share}, in {duration(seconds)}{rate}. Each was proved "
-            "to stay clear before the robot moved, and again as it was measured"
+            f" attempted trajectories were kept{share}, in {duration(seconds)}{rate}. Each was "
+            "proved to stay clear before the robot moved, and again as it was measured"
             + (f": by at least {_millimetres(float(clear))}." if clear else "."),
         )
     ]

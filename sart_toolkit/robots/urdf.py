@@ -152,8 +152,8 @@ def _compose(
         drawn = link.find("visual") is not None and link.get("name") not in added
         if drawn and link.find("collision") is None:
             raise InvalidInput(
-                f"link {link.get('name')!r}: is drawn but has no collision shape, so nothing can be "
-                "proved about it; give it one in the URDF"
+                f"link {link.get('name')!r}: is drawn but has no collision shape, so nothing can "
+                "be proved about it; give it one in the URDF"
             )
     ET.indent(robot)
     ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)

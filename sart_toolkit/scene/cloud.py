@@ -8,17 +8,15 @@ out, and a rule for the space that no picture shows.
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import minimum_filter
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
 from sart_toolkit.errors import InvalidInput, Mismatch, unknown_name
 from sart_toolkit.poses import (
@@ -32,7 +30,8 @@ from sart_toolkit.poses import (
 from sart_toolkit.records import CameraRecord, Demonstration, Image
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape
-from sart_toolkit.scene.collision import ConvexPart, coal_transform, robot_parts
+from sart_toolkit.scene.collision import robot_parts
+from sart_toolkit.scene.hull import Hull
 from sart_toolkit.scene.spec import SceneSpec
 
 # A picture looks through a point when all it sees around it lies farther by this.
@@ -42,13 +41,6 @@ _STEP, _TURN = 0.02, np.deg2rad(6.0)
 _MAX_PICTURES = 14
 # How far from the tool what it took away may reach, and how far it must have moved [m].
 _CARRIED_REACH, _CARRIED_AWAY = 0.15, 0.03
-# So many points at a time are held against all faces of a part.
-_BLOCK = 256
-# The 13 axes through the corners, edges and faces of a cube.
-_AXES = np.array(
-    [a for a in itertools.product((-1, 0, 1), repeat=3) if a > (0, 0, 0)], dtype=np.float64
-)
-_AXES /= np.linalg.norm(_AXES, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
@@ -135,7 +127,7 @@ class SceneCloud:
         Raises:
             InvalidInput: fewer than four points, or all in one plane.
         """
-        hull = _Hull(check_array("p_world", p_world, (None, 3)))
+        hull = Hull(check_array("p_world", p_world, (None, 3)))
         grown = 2 * self.config.voxel if margin is None else margin
         keep = ~hull.near(self.points, grown)
         return SceneCloud(self.points[keep], self.colours[keep], self.behind[keep], self.config)
@@ -160,50 +152,6 @@ class CarriedObject:
             )
 
 
-class _Hull:
-    """The convex hull of points, as half-spaces and a bounding sphere in their frame."""
-
-    def __init__(self, points: Array) -> None:
-        try:
-            hull = ConvexHull(points)
-        except (QhullError, ValueError) as error:
-            raise InvalidInput(
-                f"hull of {len(points)} points: expected at least 4 that are not in one plane"
-            ) from error
-        equations = hull.equations
-        # A flat face comes as many triangles; one half-space serves.
-        _, first = np.unique(np.round(equations, 6), axis=0, return_index=True)
-        self._normals, self._offsets = equations[first, :3], equations[first, 3]
-        self.corners = hull.vertices
-        corners = points[self.corners]
-        self.centre = (corners.min(0) + corners.max(0)) / 2
-        self.radius = float(np.linalg.norm(corners - self.centre, axis=1).max())
-        along = corners @ _AXES.T
-        self._low, self._high = along.min(0), along.max(0)
-
-    def coarse_bound(self, p: Array) -> Array:
-        """A lower bound `(n,)` of the distances of points to the hull, quickly computed."""
-        along = _AXES @ p.T
-        return np.maximum(along - self._high[:, None], self._low[:, None] - along).max(axis=0)
-
-    def bound(self, p: Array) -> Array:
-        """A lower bound `(n,)` of the signed distances of points to the hull.
-
-        It is the distance where the nearest point of the hull is on a face, and inside.
-        """
-        return (self._normals @ p.T + self._offsets[:, None]).max(axis=0)
-
-    def near(self, p: Array, margin: float) -> NDArray[np.bool_]:
-        """Which points `(n, 3)` are inside the hull, its half-spaces grown by a margin [m].
-
-        The coarse axes cut off the far corners that a sharp edge's half-spaces grow.
-        """
-        inside = self.coarse_bound(p) <= margin
-        found = np.flatnonzero(inside)
-        inside[found] = self.bound(p[found]) <= margin
-        return inside
-
-
 class _OwnBody:
     """The robot's convex parts and what it carried, wherever its joints and its gripper are."""
 
@@ -216,7 +164,7 @@ class _OwnBody:
     ) -> None:
         self._steps = demonstration.steps
         self._robot, self._held = robot, tuple(held)
-        self._carried = [(each, _Hull(each.points)) for each in carried]
+        self._carried = [(each, Hull(each.points)) for each in carried]
         self._models: dict[float, RobotModel] = {}
         model = self._model(0.0)
         Ts_link = model.link_poses(robot.home)
@@ -225,7 +173,7 @@ class _OwnBody:
         self._parts = []
         for part in robot_parts(model):
             T = inverse(Ts_link[part.body]) @ Ts_joint[part.joint]
-            self._parts.append((part.body, _Hull(part.points @ T[:3, :3].T + T[:3, 3])))
+            self._parts.append((part.body, Hull(part.points @ T[:3, :3].T + T[:3, 3])))
 
     def _model(self, gripper: float) -> RobotModel:
         opening = round(float(np.clip(gripper, 0.0, 1.0)), 2)
@@ -372,7 +320,7 @@ def fuse_cloud(
         T = demonstration.steps.measured_Ts_world_tool[each.waypoints[0]]
         p_tool = (cells.points - T[:3, 3]) @ T[:3, :3]
         before = cells.last < each.waypoints[0]
-        keep &= ~(before & _Hull(each.points).near(p_tool, config.self_margin))
+        keep &= ~(before & Hull(each.points).near(p_tool, config.self_margin))
     if not keep.any():
         raise InvalidInput(
             f"cloud: expected something {config.near} to {config.far} m before the camera and "
@@ -679,149 +627,3 @@ def _surface_distance(shape: Shape, p: Array) -> Array:
         over = np.stack([np.hypot(p[:, 0], p[:, 1]) - radius, np.abs(p[:, 2]) - length / 2], axis=1)
     outside = np.linalg.norm(np.maximum(over, 0.0), axis=1)
     return np.where(outside > 0, outside, -over.max(axis=1))
-
-
-@dataclass(frozen=True)
-class CloudSeparation:
-    """How far a part of the robot is from one point of a cloud.
-
-    `distance` [m] to the ball about `p_cloud (3,)`, negative where they overlap; `p_part (3,)` is
-    the part's point nearest to it, `normal (3,)` the unit vector from cloud to part; world frame.
-    """
-
-    link: str
-    distance: float
-    p_part: Array
-    p_cloud: Array
-    normal: Array
-
-
-class CloudObstacles:
-    """Distances from the robot's convex parts to the balls about a cloud's points."""
-
-    def __init__(self, cloud: SceneCloud) -> None:
-        """Index the points of `cloud`; seen or filled in, all count."""
-        self._points = cloud.points
-        self._tree = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False)
-        self._inflation = cloud.config.inflation
-        self._ball = coal.Sphere(cloud.config.inflation)
-        # A geometry is kept with its hull, so that no other gets its id.
-        self._hulls: dict[int, tuple[ConvexPart, _Hull]] = {}
-
-    def _hull(self, part: ConvexPart) -> _Hull:
-        kept = self._hulls.get(id(part.geometry))
-        if kept is None:
-            kept = self._hulls[id(part.geometry)] = (part, _Hull(part.points))
-        return kept[1]
-
-    def _separation(
-        self, part: ConvexPart, placed: coal.Transform3s, index: int
-    ) -> CloudSeparation:
-        p_cloud = self._points[index]
-        # A result that is not new keeps the smallest distance it has seen.
-        result = coal.DistanceResult()
-        distance = coal.distance(
-            self._ball,
-            coal.Transform3s(np.eye(3), p_cloud),
-            part.geometry,
-            placed,
-            coal.DistanceRequest(),
-            result,
-        )
-        return CloudSeparation(
-            part.body,
-            float(distance),
-            np.array(result.getNearestPoint2()),
-            p_cloud,
-            np.array(result.normal),
-        )
-
-    def _candidates(
-        self, hull: _Hull, T_world_joint: Array, within: float
-    ) -> tuple[NDArray[np.intp], Array, Array]:
-        """Points whose ball may be within a distance [m] of a hull, most likely first.
-
-        Their rows `(m,)`, their places `(m, 3)` in the joint's frame, and a lower bound `(m,)`.
-        """
-        centre = T_world_joint[:3, :3] @ hull.centre + T_world_joint[:3, 3]
-        # Where balls overlap with a part `within` may be negative.
-        reach = max(hull.radius + within + self._inflation, 0.0)
-        rows = np.array(self._tree.query_ball_point(centre, reach), dtype=np.intp)
-        p = (self._points[rows] - T_world_joint[:3, 3]) @ T_world_joint[:3, :3]
-        bounds = hull.coarse_bound(p) - self._inflation
-        order = np.flatnonzero(bounds <= within)
-        order = order[np.argsort(bounds[order], kind="stable")]
-        return rows[order], p[order], bounds[order]
-
-    def distances(
-        self, part: ConvexPart, T_world_joint: Array, within: float
-    ) -> list[CloudSeparation]:
-        """The part's distance from each point, up to its smallest one plus `within`; nearest first.
-
-        Args:
-            part: convex part of the robot.
-            T_world_joint: the pose `(4, 4)` of the joint that carries it.
-            within: [m].
-        """
-        if not len(self._points):
-            return []
-        hull = self._hull(part)
-        placed = coal_transform(T_world_joint @ part.T_joint_part)
-        centre = T_world_joint[:3, :3] @ hull.centre + T_world_joint[:3, 3]
-        first = int(self._tree.query(centre)[1])
-        found = [self._separation(part, placed, first)]
-        smallest = found[0].distance
-        rows, p, coarse = self._candidates(hull, T_world_joint, smallest + within)
-        for start in range(0, len(rows), _BLOCK):
-            if coarse[start] > smallest + within:
-                break
-            bounds = hull.bound(p[start : start + _BLOCK]) - self._inflation
-            for at in np.argsort(bounds, kind="stable"):
-                if bounds[at] > smallest + within:
-                    break
-                row = int(rows[start + at])
-                if row == first:
-                    continue
-                found.append(self._separation(part, placed, row))
-                smallest = min(smallest, found[-1].distance)
-        found = [each for each in found if each.distance <= smallest + within]
-        return sorted(found, key=lambda each: each.distance)
-
-    def nearest(self, parts: Iterable[tuple[ConvexPart, Array]]) -> CloudSeparation | None:
-        """The smallest distance of some parts, each with its joint's pose; None without points."""
-        found = [each for part, T in parts for each in self.distances(part, T, 0.0)[:1]]
-        return min(found, key=lambda each: each.distance, default=None)
-
-    def any_within(self, parts: Iterable[tuple[ConvexPart, Array]], margin: float) -> str | None:
-        """The link of a part that is nearer than `margin` [m] to the cloud, or None.
-
-        Args:
-            parts: convex parts, each with the pose `(4, 4)` of the joint that carries it.
-            margin: [m].
-        """
-        for part, T in parts:
-            hull = self._hull(part)
-            rows, p, _ = self._candidates(hull, T, margin)
-            placed = coal_transform(T @ part.T_joint_part)
-            for start in range(0, len(rows), _BLOCK):
-                bounds = hull.bound(p[start : start + _BLOCK]) - self._inflation
-                for at in np.flatnonzero(bounds < margin):
-                    row = int(rows[start + at])
-                    if self._separation(part, placed, row).distance < margin:
-                        return part.body
-        return None
-
-
-def hull_part(name: str, joint: int, points: Array) -> ConvexPart:
-    """The convex hull of points `(m, 3)` [m] in a joint's frame, as a part that the joint carries.
-
-    Raises:
-        InvalidInput: fewer than four points, or all in one plane.
-    """
-    points = check_array(f"points of {name}", points, (None, 3))
-    corners = points[_Hull(points).corners]
-    listed = coal.StdVec_Vec3s()
-    for corner in corners:
-        listed.append(corner)
-    geometry = coal.ConvexBase.convexHull(listed, False, "Qt")
-    return ConvexPart(name, joint, geometry, np.eye(4), corners)

@@ -13,14 +13,13 @@ from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scene.cloud import (
     CarriedObject,
     CloudConfig,
-    CloudObstacles,
     SceneCloud,
     carried_object,
     fuse_cloud,
-    hull_part,
 )
 from sart_toolkit.scene.collision import CollisionModel, ConvexPart, PlacedModel
 from sart_toolkit.scene.demonstrated import demonstration_phases
+from sart_toolkit.scene.obstacles import CloudObstacles, hull_part
 from sart_toolkit.scene.spec import SceneSpec
 from sart_toolkit.teach.suggest import Gap, SuggestConfig, Suggestion
 
@@ -123,6 +122,7 @@ class CloudSurroundings:
         gripper = float(np.clip(self._demonstration.steps.measured_gripper[t], 0.0, 1.0))
         return self._collision.placed({}, round(gripper, 2))
 
+    @functools.cache  # noqa: B019 - as long as the demonstration's waypoints
     def _parts(self, t: int) -> list[ConvexPart]:
         """The robot's moving parts at a waypoint, and the hull of what is carried."""
         placed = self._placed(t)
@@ -159,7 +159,7 @@ class CloudSurroundings:
             points = part.points @ T_joint[:3, :3].T + T_joint[:3, 3] - p_tool
             for found in obstacles.distances(part, T_joint, within):
                 support = float(found.normal @ (found.p_cloud - p_tool)) + self._config.inflation
-                gap = Gap(found.link, _OBSTACLE, found.distance, found.normal, points, support)
+                gap = Gap(found.body, _OBSTACLE, found.distance, found.normal, points, support)
                 best = gap.limited(best, config)
         return best
 

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.motion.controller import ControllerConfig, ToolController
+from sart_toolkit.motion.line import straight_line
 from sart_toolkit.poses import check_pose, distance, interpolate, pose
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=40)
@@ -184,6 +185,118 @@ def test_a_measured_pose_that_is_none_changes_nothing(controller, bad):
     # Were it let through, NaN would silently switch the clamp off.
     away = controller.commanded_T_world_tool @ pose([0.1, 0, 0])
     assert_unchanged_by(controller, InvalidInput, "measured_T_world_tool: ", away, bad, 1)
+
+
+# --- following a planned motion -----------------------------------------------------------------
+
+
+@PROPERTY
+@given(away=offsets(0.01, 0.04), q_away=st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6))
+def test_what_is_followed_is_commanded_as_it_is(model, away, q_away):
+    controller = make_controller(model)
+    measured = controller.commanded_T_world_tool
+    # The joints are the planner's business: they are not solved for again.
+    q = model.spec.home + q_away
+    controller.follow(q, measured @ away, measured)
+    np.testing.assert_array_equal(controller.commanded_q, q)
+    np.testing.assert_array_equal(controller.commanded_T_world_tool, measured @ away)
+
+
+def test_a_motion_is_followed_from_its_start_to_its_end(controller, model):
+    T = controller.commanded_T_world_tool
+    line = straight_line(model, model.spec.home, T, T @ pose([0.05, 0, -0.05], [0, 0, 0.2]), 1.0)
+    times = line.times(30)
+    for time, q in zip(times, line.joints(times), strict=True):
+        # The tool lags a little behind.
+        measured = line.T_world_tool(time - 0.05)
+        controller.follow(q, line.T_world_tool(time), measured)
+        np.testing.assert_allclose(
+            model.fk(controller.commanded_q), controller.commanded_T_world_tool, atol=3e-5
+        )
+    np.testing.assert_array_equal(controller.commanded_q, line.path.positions(np.ones(1))[0])
+    np.testing.assert_array_equal(controller.commanded_T_world_tool, line.T_world_tool(9.0))
+
+
+def test_after_following_moves_go_on_from_there(controller, model):
+    T = controller.commanded_T_world_tool
+    near = T @ pose([0, 0, 0.01])
+    q = model.ik(near, model.spec.home)
+    controller.follow(q, near, T)
+    targets = controller.move(near @ pose([0.005, 0, 0]), near, 3)
+    np.testing.assert_allclose(targets[0], q, atol=0.02)
+    fresh = make_controller(model)
+    fresh.reset(q, near)
+    np.testing.assert_array_equal(fresh.move(near @ pose([0.005, 0, 0]), near, 3), targets)
+
+
+@PROPERTY
+@given(away=offsets(0.05, 0.2), q_away=st.floats(-0.1, 0.1))
+def test_what_the_clamp_would_change_is_not_followed(model, away, q_away):
+    controller = make_controller(model)
+    q_before, T_before = controller.commanded_q, controller.commanded_T_world_tool
+    T = T_before @ away
+    far, turned = distance(T_before, T)
+    if far <= LEAD and turned <= LEAD_ANGLE:
+        controller.follow(q_before + q_away, T, T_before)
+        np.testing.assert_array_equal(controller.commanded_T_world_tool, T)
+    else:
+        with pytest.raises(MotionRejected, match="tool lags behind: .* mm and .* deg; allow more"):
+            controller.follow(q_before + q_away, T, T_before)
+        np.testing.assert_array_equal(controller.commanded_q, q_before)
+        np.testing.assert_array_equal(controller.commanded_T_world_tool, T_before)
+
+
+@pytest.mark.parametrize(
+    ("lag", "message"),
+    [
+        (pose([0, 0.0201, 0]), "^tool lags behind: 20 mm and 0 deg; allow more time$"),
+        (pose(rotvec=[0, 0, np.deg2rad(7)]), "^tool lags behind: 0 mm and 7 deg; allow more time$"),
+        (pose([0.3, 0, 0.4], [1, 0, 0]), "^tool lags behind: 500 mm and 57 deg; allow more time$"),
+    ],
+)
+def test_a_rejection_says_how_far_the_tool_lags_behind(controller, model, lag, message):
+    T, q = controller.commanded_T_world_tool, controller.commanded_q
+    with pytest.raises(MotionRejected, match=message):
+        controller.follow(q + 0.1, T @ lag, T)
+    np.testing.assert_array_equal(controller.commanded_q, q)
+    np.testing.assert_array_equal(controller.commanded_T_world_tool, T)
+
+
+def test_another_lead_may_be_configured_for_what_is_followed(model):
+    controller = ToolController(model, ControllerConfig(max_lead=0.005, max_lead_deg=1.0))
+    T, q = controller.commanded_T_world_tool, controller.commanded_q
+    controller.follow(q, T @ pose([0.0049, 0, 0]), T)
+    for away in (pose([0.0051, 0, 0]), pose(rotvec=[np.deg2rad(1.1), 0, 0])):
+        with pytest.raises(MotionRejected, match="tool lags behind"):
+            controller.follow(q, T @ away, T)
+
+
+@pytest.mark.parametrize(
+    ("q", "T", "measured", "message"),
+    [
+        (np.zeros(5), np.eye(4), np.eye(4), r"q: expected shape \(6,\), got \(5,\)"),
+        (np.full(6, np.nan), np.eye(4), np.eye(4), "q: has NaN or infinite entries"),
+        (np.zeros(6), np.eye(3), np.eye(4), r"T_world_tool: expected pose shape \(4, 4\)"),
+        (np.zeros(6), 2 * np.eye(4), np.eye(4), "^T_world_tool: not a rigid transform"),
+        # Were it let through, NaN would silently switch the check off.
+        (np.zeros(6), np.eye(4), np.full((4, 4), np.nan), "^measured_T_world_tool: has NaN"),
+        (np.zeros(6), np.eye(4), np.eye(3), "^measured_T_world_tool: expected pose shape"),
+    ],
+)
+def test_what_is_no_configuration_or_pose_is_not_followed(controller, q, T, measured, message):
+    q_before, T_before = controller.commanded_q, controller.commanded_T_world_tool
+    with pytest.raises(InvalidInput, match=message):
+        controller.follow(q, T, measured)
+    np.testing.assert_array_equal(controller.commanded_q, q_before)
+    np.testing.assert_array_equal(controller.commanded_T_world_tool, T_before)
+
+
+def test_what_was_followed_can_not_be_changed_from_outside(controller, model):
+    q, T = np.array(model.spec.home), controller.commanded_T_world_tool
+    controller.follow(q, T, T)
+    q[:], T[:] = 0, 0
+    np.testing.assert_array_equal(controller.commanded_q, model.spec.home)
+    check_pose("commanded", controller.commanded_T_world_tool)
 
 
 # --- reset --------------------------------------------------------------------------------------

@@ -19,14 +19,13 @@ from sart_toolkit.robots.spec import Shape
 from sart_toolkit.scene.cloud import (
     CarriedObject,
     CloudConfig,
-    CloudObstacles,
     SceneCloud,
     carried_object,
     fuse_cloud,
-    hull_part,
     surface_errors,
 )
 from sart_toolkit.scene.collision import coal_transform, convex_distance, robot_parts
+from sart_toolkit.scene.obstacles import CloudObstacles, hull_part
 from sart_toolkit.scene.spec import Body, SceneSpec
 
 FLOOR = -0.20
@@ -373,7 +372,7 @@ def cube():
 def test_the_distance_to_a_point_is_that_to_its_ball(cube):
     obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.05]], inflation=0.002))
     (found,) = obstacles.distances(cube, pose([0.0, 0.003, 0.0]), 0.0)
-    assert found.link == "cube"
+    assert found.body == "cube"
     assert found.distance == pytest.approx(0.038, abs=1e-6)
     np.testing.assert_allclose(found.normal, [0, 0, -1], atol=1e-6)
     np.testing.assert_allclose(found.p_cloud, [0, 0, 0.05])
@@ -407,7 +406,7 @@ def test_no_point_that_is_near_enough_is_missed(peg_model, within):
         assert len(distances) >= len(wanted)
         assert obstacles.nearest([(part, T)]).distance == pytest.approx(exact.min(), abs=2e-6)
         assert obstacles.any_within([(part, T)], exact.min() - 1e-5) is None
-        assert obstacles.any_within([(part, T)], exact.min() + 1e-5) == part.link
+        assert obstacles.any_within([(part, T)], exact.min() + 1e-5) == part.body
 
 
 def one_by_one(obstacles, part, T, p):
@@ -423,7 +422,7 @@ def test_the_nearest_of_several_parts_and_the_one_too_near_are_told_by_name(cube
     other = hull_part("other", 1, CUBE)
     obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.0]]))
     parts = [(cube, pose([0.1, 0, 0])), (other, pose([0, 0.05, 0]))]
-    assert obstacles.nearest(parts).link == "other"
+    assert obstacles.nearest(parts).body == "other"
     assert obstacles.any_within(parts, 0.045) == "other"
     assert obstacles.any_within(parts, 0.03) is None
 
