@@ -9,6 +9,7 @@ import numpy as np
 from sart_toolkit.augment.strategies import SamplingConfig, get_strategy
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import check_positive
+from sart_toolkit.scene.demonstrated import GRASP_PLAY
 
 
 @dataclass(frozen=True)
@@ -17,8 +18,9 @@ class AugmentConfig:
 
     `n`: trajectories in all, the demonstration among them; the others go round-robin over the
     spheres. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
-    proved to keep `margin` [m] free. `camera`: whose pictures are recorded,
-    `None` for none.
+    proved to keep `margin` [m] free, even if what is carried moves by `grasp_play` [m] in the
+    grasp; if any point of it moves farther the segment is rejected. `camera`: whose pictures are
+    recorded, `None` for none.
     """
 
     n: int = 40
@@ -26,6 +28,7 @@ class AugmentConfig:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     duration: float = 2.0
     margin: float = 0.0002
+    grasp_play: float = GRASP_PLAY
     seed: int = 0
     camera: str | None = "wrist"
 
@@ -35,6 +38,8 @@ class AugmentConfig:
         if self.seed < 0:
             raise InvalidInput(f"seed: expected a whole number >= 0, got {self.seed}")
         check_positive("duration", self.duration, "s")
-        if not (np.isfinite(self.margin) and self.margin >= 0):
-            raise InvalidInput(f"margin: expected a finite number >= 0 m, got {self.margin}")
+        for name in ("margin", "grasp_play"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InvalidInput(f"{name}: expected a finite number >= 0 m, got {value}")
         get_strategy(self.strategy)

@@ -17,7 +17,7 @@ from sart_toolkit.motion.line import straight_line
 from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.motion.planning import plan_motion
 from sart_toolkit.motion.timing import Motion
-from sart_toolkit.poses import Array, distance, inverse
+from sart_toolkit.poses import Array, inverse
 from sart_toolkit.records import (
     CONTROL_HZ,
     CONTROL_PER_RECORD,
@@ -34,8 +34,8 @@ from sart_toolkit.scene.spec import SceneSpec
 from sart_toolkit.teach.recorder import StepRecorder
 
 KEPT = "kept"
-_SLIP, _SLIP_DEG = 0.005, 3.0
-_MOVED, _MOVED_DEG = 0.001, 0.5
+# By no more than this [m] may any point of a body be moved that isn't carried.
+_MOVED = 0.001
 _PATH_SAMPLES = 1000
 
 
@@ -63,7 +63,7 @@ class SegmentPlanner:
         Raises:
             Mismatch: the demonstration doesn't tell where the scene's bodies were.
         """
-        self.scene = DemonstratedScene(demonstration, robot, scene)
+        self.scene = DemonstratedScene(demonstration, robot, scene, config.grasp_play)
         self._annotation, self._config = annotation, config
 
     def proposal(self, sphere: int, k: int) -> tuple[Proposal, np.random.Generator]:
@@ -193,7 +193,7 @@ class SegmentMaker:
             else:
                 seen = recorded = recorder.add(controller, gripper, 0.0)
             measured.append(seen.joint_path if len(seen.joint_path) else seen.q[None])
-        check_undisturbed(backend.scene, carried, start, recorded)
+        check_undisturbed(backend.scene, carried, start, recorded, self._config.grasp_play)
         return recorder, np.concatenate(measured)
 
     def _proof(
@@ -235,7 +235,11 @@ def check_untouched(backend: Backend, carried: frozenset[str]) -> None:
 
 
 def check_undisturbed(
-    scene: SceneSpec, carried: frozenset[str], start: Observation, end: Observation
+    scene: SceneSpec,
+    carried: frozenset[str],
+    start: Observation,
+    end: Observation,
+    grasp_play: float,
 ) -> None:
     """Return if what is carried stayed in the grasp and all else where it was.
 
@@ -246,15 +250,17 @@ def check_undisturbed(
         if body.mass is None or body.name not in start.Ts_world_body:
             continue
         Ts = [seen.Ts_world_body[body.name] for seen in (start, end)]
+        most = _MOVED
         if body.name in carried:
+            most = grasp_play
             Ts = [inverse(seen.T_world_tool) @ T for seen, T in zip((start, end), Ts, strict=True)]
-        far, turn = distance(*Ts)
-        most, most_deg = (_SLIP, _SLIP_DEG) if body.name in carried else (_MOVED, _MOVED_DEG)
-        if far > most or turn > np.deg2rad(most_deg):
+        # The farthest that any point of the body has moved.
+        corners = np.concatenate([shape.corners() for shape in body.shapes])
+        moved = corners @ (Ts[1] - Ts[0])[:3, :3].T + (Ts[1] - Ts[0])[:3, 3]
+        far = float(np.linalg.norm(moved, axis=1).max())
+        if far > most:
             what = "slipped in the grasp" if body.name in carried else "was moved"
-            raise MotionRejected(
-                f"{body.name} {what}: by {far * 1e3:.1f} mm and {np.rad2deg(turn):.1f} deg"
-            )
+            raise MotionRejected(f"{body.name} {what}: by {far * 1e3:.1f} mm")
 
 
 def path_deviation(placed: PlacedModel, motion: Motion, joint_path: Array) -> float:

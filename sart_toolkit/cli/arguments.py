@@ -30,6 +30,9 @@ _YAW = Annotated[
 _LOOKS = Annotated[bool, arg(help="Vary colours, light and the wrist camera's mounting at random.")]
 _TASKS = Annotated[str, arg(help="Names of tasks with commas between, or all.")]
 _BACKENDS = Annotated[str, arg(help="Names of backends with commas between, or all.")]
+_GRASP_PLAY = Annotated[
+    float, arg(help="How far what is carried may move in the grasp [m]; so much more is kept free.")
+]
 _LAW = Annotated[
     Literal["paper", "area"],
     arg(help="How positions are drawn on a sphere: as the paper says, or uniform over its area."),
@@ -118,6 +121,7 @@ class Suggest:
     margin: Annotated[float, arg(help="Distance that stays free of the tool everywhere [m].")] = (
         0.0005
     )
+    grasp_play: _GRASP_PLAY = 0.005
     min_radius: Annotated[float, arg(help="Smallest sphere worth having [m].")] = 0.004
     max_radius: Annotated[float, arg(help="Largest sphere [m].")] = 0.15
     overwrite: _OVERWRITE = False
@@ -153,6 +157,7 @@ class Augment:
     margin: Annotated[
         float, arg(help="Distance that every segment is proved to keep free [m].")
     ] = 0.0002
+    grasp_play: _GRASP_PLAY = 0.005
     seed: _SEED = 0
     workers: _WORKERS = 1
     overwrite: _OVERWRITE = False

@@ -156,9 +156,10 @@ def suggest_verb(args: Suggest) -> Result:
     surroundings: Surroundings
     if args.source == "cloud":
         cloud = CloudConfig(unknown=args.unknown)
-        surroundings = CloudSurroundings(demonstration, robot, task.scene, cloud)
+        surroundings = CloudSurroundings(demonstration, robot, task.scene, cloud, args.grasp_play)
     else:
-        surroundings = ExactSurroundings(DemonstratedScene(demonstration, robot, task.scene))
+        scene = DemonstratedScene(demonstration, robot, task.scene, args.grasp_play)
+        surroundings = ExactSurroundings(scene)
     with progress_bar("suggest", len(demonstration), "waypoint") as bar:
         annotation = suggest_annotation(
             demonstration,
@@ -192,6 +193,7 @@ def augment_verb(args: Augment) -> Result:
         sampling=SamplingConfig(args.law, args.rotation_per_metre),
         duration=args.duration,
         margin=args.margin,
+        grasp_play=args.grasp_play,
         seed=args.seed,
     )
     task = get_task(demonstration.task)

@@ -200,6 +200,7 @@ class _Segments:
             "radius": sphere.radius,
             "limited_by": sphere.limited_by,
             "planned": None,
+            "measured": None,
         }
         try:
             motion, certificate = planner.plan(proposal, rng)
@@ -218,9 +219,11 @@ class _Segments:
         row["outcome"] = attempt.outcome
         if attempt.episode is not None and motion is not None:
             proof = attempt.episode.provenance.certificate or {}
-            row["measured_clearance"] = proof["measured"]["clearance"]
-            row["deviation"] = proof["deviation"]
-            row["measured_off"] = tool_off_path(model, motion, attempt.episode.joint_path)
+            row["measured"] = {
+                "clearance": proof["measured"]["clearance"],
+                "deviation": proof["deviation"],
+                "off": tool_off_path(model, motion, attempt.episode.joint_path),
+            }
         return row | {"wall": time.perf_counter() - started}
 
     def close(self) -> None:
@@ -310,25 +313,21 @@ def _segments_summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _segments_totals(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    kept = [row for row in rows if row["outcome"] == KEPT]
+    kept = sum(row["outcome"] == KEPT for row in rows)
     planned = [row["planned"] for row in rows if row["planned"] is not None]
+    measured = [row["measured"] for row in rows if row["measured"] is not None]
     return {
         "attempted": len(rows),
         "certified": len(planned),
-        "kept": len(kept),
-        "kept_rate": len(kept) / len(rows),
-        "ci95": list(wilson_interval(len(kept), len(rows))),
+        "kept": kept,
+        "kept_rate": kept / len(rows),
+        "ci95": list(wilson_interval(kept, len(rows))),
         "rejections": _rejections(rows),
         "contacts": sum(map(_touched, rows)),
         "left_path": sum(map(_left, rows)),
-        "least_clearance_mm": _millimetres(min, [each["clearance"] for each in planned]),
-        "least_measured_clearance_mm": _millimetres(
-            min, [row["measured_clearance"] for row in kept]
-        ),
-        "deviation_mm": {
-            name: _millimetres(of, [row["deviation"] for row in kept])
-            for name, of in (("median", np.median), ("max", max))
-        },
+        "least_clearance_mm": _least_mm(planned, "clearance"),
+        "least_measured_clearance_mm": _least_mm(measured, "clearance"),
+        "deviation_mm": _spread_mm(measured, "deviation"),
         "limits": {
             "motions_that_violate": sum(each["violations"] > 0 for each in planned),
             "greatest_ratio": {
@@ -336,14 +335,8 @@ def _segments_totals(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 for i, name in enumerate(("velocity", "acceleration", "jerk"))
             },
         },
-        "commands_off_path_mm": {
-            name: _millimetres(of, [each["off"] for each in planned])
-            for name, of in (("median", np.median), ("max", max))
-        },
-        "measured_off_path_mm": {
-            name: _millimetres(of, [row["measured_off"] for row in kept])
-            for name, of in (("median", np.median), ("max", max))
-        },
+        "commands_off_path_mm": _spread_mm(planned, "off"),
+        "measured_off_path_mm": _spread_mm(measured, "off"),
         "lengthened": sum(each["lengthened"] for each in planned),
         "longest_seconds": max((each["duration"] for each in planned), default=None),
         "tries_per_second_and_process": len(rows) / sum(row["wall"] for row in rows),
@@ -364,8 +357,16 @@ def _rejections(rows: Sequence[dict[str, Any]]) -> dict[str, int]:
     return dict(outcomes.most_common())
 
 
-def _millimetres(of: Callable[[Sequence[float]], Any], lengths: Sequence[float]) -> float | None:
-    return float(of(lengths)) * 1e3 if lengths else None
+def _least_mm(rows: Sequence[Mapping[str, float]], key: str) -> float | None:
+    return min((row[key] * 1e3 for row in rows), default=None)
+
+
+def _spread_mm(rows: Sequence[Mapping[str, float]], key: str) -> dict[str, float | None]:
+    lengths = [row[key] * 1e3 for row in rows]
+    return {
+        "median": float(np.median(lengths)) if lengths else None,
+        "max": max(lengths, default=None),
+    }
 
 
 # --- radii --------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from scipy.interpolate import BSpline
 from sart_toolkit.errors import InvalidInput, MissingExtra, MotionRejected, Unreachable
 from sart_toolkit.motion.path import PolylinePath, SplinePath
 from sart_toolkit.motion.timing import Motion, timed
-from sart_toolkit.poses import Array, check_pose, check_positive, interpolate
+from sart_toolkit.poses import Array, check_pose, check_positive, distance, interpolate
 from sart_toolkit.records import RECORD_HZ
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scene.certificate import Certificate, certify
@@ -37,7 +37,8 @@ _FROM_LIMIT = 0.01
 # Another branch of the arm has some joint farther from the start than this [rad].
 _BRANCH = np.pi / 2
 _GOAL_SEEDS = 8
-_LENGTH_SAMPLES = 100
+# Strides that are measured in each recorded step.
+_STRIDES = 3
 # What is spared beyond the margin is cut to this where no path is found else.
 _NARROW = 0.2
 
@@ -50,7 +51,8 @@ class PlanConfig:
     The trees grow by edges of up to `edge` [rad], each proved to keep `spare` [m] beyond the
     margin, or half of what start or goal has beyond it where that is less. Of up to `tries` paths
     the shortest is taken, each after `shortcuts` rounds of shortening. After `max_edges` edges no
-    further path is looked for. The tool's average speed along a path is no more than `speed` [m/s].
+    further path is looked for. From one recorded step to the next the tool moves no farther than
+    `stride` [m] and turns no farther than `stride_deg`, well within a `ToolController`'s lead.
     """
 
     window: float = 1.2
@@ -59,10 +61,11 @@ class PlanConfig:
     tries: int = 3
     shortcuts: int = 3
     max_edges: int = 600
-    speed: float = 0.2
+    stride: float = 0.016
+    stride_deg: float = 4.0
 
     def __post_init__(self) -> None:
-        units = {"window": "rad", "edge": "rad", "spare": "m", "speed": "m/s"}
+        units = {"window": "rad", "edge": "rad", "spare": "m", "stride": "m", "stride_deg": "deg"}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             check_positive(field.name, value, units.get(field.name, ""))
@@ -101,7 +104,7 @@ def plan_motion(
         placed: robot and scene.
         q_start: joint configuration `(n,)` at the start.
         T_world_goal: tool pose `(4, 4)` at the end; the arm stays on the start's branch.
-        duration: seconds from rest to rest, if the joints' limits and the tool's speed allow.
+        duration: seconds from rest to rest, if the joints' limits and the tool's strides allow.
         margin: clearance [m] to keep, >= 0.
         rng: decides the path.
         config: how it is looked for.
@@ -122,10 +125,13 @@ def plan_motion(
         raise _too_close("sampled pose", placed, goals[0], margin, "use a smaller radius")
     path, certificate = plan_path(placed, q_start, clear[0], margin, rng, config)
     T_at = functools.partial(_tool_pose, model, path)
-    positions = np.array([T_at(s)[:3, 3] for s in np.linspace(0.0, 1.0, _LENGTH_SAMPLES)])
-    length = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
-    least = np.ceil(length / config.speed * RECORD_HZ) / RECORD_HZ
-    return timed(model, path, max(duration, float(least)), T_at), certificate
+    motion = timed(model, path, duration, T_at)
+    excess = _longest_stride(motion, config)
+    if excess > 1:
+        # Ramps don't grow with the duration, so that speeds fall by more than this.
+        slower = float(np.ceil(motion.duration * excess * RECORD_HZ)) / RECORD_HZ
+        motion = timed(model, path, slower, T_at)
+    return motion, certificate
 
 
 def plan_path(
@@ -211,6 +217,16 @@ def _goal_configurations(model: RobotModel, q_start: Array, T_world_goal: Array)
 
 def _tool_pose(model: RobotModel, path: SplinePath, s: float) -> Array:
     return model.fk(path.positions(np.array([s]))[0])
+
+
+def _longest_stride(motion: Motion, config: PlanConfig) -> float:
+    """The tool's longest stride during one recorded step, as a share of what is allowed."""
+    period, largest = 1 / RECORD_HZ, np.deg2rad(config.stride_deg)
+    ends = np.append(np.arange(period, motion.duration, period / _STRIDES), motion.duration)
+    strides = [
+        distance(motion.T_world_tool(end - period), motion.T_world_tool(end)) for end in ends
+    ]
+    return max(max(far / config.stride, turn / largest) for far, turn in strides)
 
 
 def _room(placed: PlacedModel, q: Array, margin: float) -> float:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from sart_toolkit.errors import InvalidInput, MotionRejected
 from sart_toolkit.poses import Array, check_positive
-from sart_toolkit.scene.collision import Index, PlacedModel
+from sart_toolkit.scene.collision import Index, PlacedModel, norms
 
-_FIRST_KNOTS = 4
+_FIRST_KNOTS = 3
 _FAR = 0.01
 _CHECKS = 20_000
 # coal's distances are up to 2.2e-6 m too large, by its tolerance.
@@ -123,28 +123,59 @@ def certify(
     return _Search(placed, path, margin, max_checks).run()
 
 
+@dataclass(frozen=True)
+class _Knots:
+    """What is known at some path parameters `s (k,)`, where the joints are at `q (k, n)`.
+
+    `turns`, `moments (k, n, 3)`: the joints' axes, and the velocity of the point at the origin that
+    turning about each gives; `centres`, `axes`, `middles`: spheres and boxes of the parts, as from
+    `Bounds.placed`; `distances (k, p)`: the pairs' by coal, NaN where not computed yet.
+    """
+
+    s: Array
+    q: Array
+    turns: Array
+    moments: Array
+    centres: Array
+    axes: Array
+    middles: Array
+    distances: Array
+
+    @staticmethod
+    def at(placed: PlacedModel, path: JointPath, s: Array) -> _Knots:
+        q = path.positions(s)
+        if not np.isfinite(q).all():
+            raise InvalidInput("joint path: has NaN or infinite entries; remove them")
+        poses = np.array([placed.joint_poses(each) for each in q])
+        # A joint's axis is its frame's z; turning about it moves the origin by p x z.
+        turns = poses[:, 1:, :3, 2]
+        moments = _cross(poses[:, 1:, :3, 3], turns)
+        unknown = np.full((len(s), len(placed.pairs)), np.nan)
+        return _Knots(s, q, turns, moments, *placed.bounds.placed(poses), unknown)
+
+    def and_then(self, more: _Knots) -> _Knots:
+        return _Knots(*(
+            np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(_Knots)
+        ))  # fmt: skip
+
+
 class _Search:
-    """The bisection of one path: its knots, the distances known there, the bound proved so far."""
+    """The bisection of one path: its knots, and the bound proved so far."""
 
     def __init__(
         self, placed: PlacedModel, path: JointPath, margin: float, max_checks: int
     ) -> None:
         self._placed, self._path = placed, path
         self._margin, self._max_checks = margin, max_checks
-        self._bounds = placed.bounds
-        self._s = np.zeros(0)
-        n = len(placed.kinematics.spec.arm_joints)
-        self._q = np.zeros((0, n))
-        # Poses of the world and all joints, the joints' axes and moments of these, at each knot.
-        self._R, self._p = np.zeros((0, n + 1, 3, 3)), np.zeros((0, n + 1, 3))
-        self._moments = np.zeros((0, n, 3))
-        self._distances = np.zeros((0, len(placed.pairs)))
+        self._knots = _Knots.at(placed, path, np.linspace(0.0, 1.0, _FIRST_KNOTS))
         self._checks = 0
         self._best, self._best_pair = np.inf, -1
 
     def run(self) -> Certificate:
-        knots = self._add_knots(np.linspace(0.0, 1.0, _FIRST_KNOTS))
-        lo, hi, pair = self._near(knots)
+        count = len(self._placed.pairs)
+        lo: Index = np.repeat(np.arange(_FIRST_KNOTS - 1), count)
+        hi = lo + 1
+        pair: Index = np.tile(np.arange(count), _FIRST_KNOTS - 1)
         while len(pair):
             mu, rough = self._motion(lo, hi, pair)
             # Rough bounds only settle what is far, so that the clearance proved says something.
@@ -154,7 +185,7 @@ class _Search:
             if not len(pair):
                 break
             if self._checks + 2 * len(pair) > self._max_checks:
-                return self._certificate("undecided", self._s[lo[0]], int(pair[0]))
+                return self._certificate("undecided", self._knots.s[lo[0]], int(pair[0]))
             d_lo, d_hi = self._exact(lo, pair), self._exact(hi, pair)
             if min(d_lo.min(), d_hi.min()) < self._margin:
                 return self._first_hit()
@@ -165,23 +196,6 @@ class _Search:
             if len(pair):
                 lo, hi, pair = self._bisect(lo, hi, pair)
         return self._certificate("free", 0.0, self._best_pair)
-
-    def _add_knots(self, s: Array) -> Index:
-        q = self._path.positions(s)
-        if not np.isfinite(q).all():
-            raise InvalidInput("joint path: has NaN or infinite entries; remove them")
-        poses = np.array([self._placed.joint_poses(each) for each in q])
-        R, p = poses[:, :, :3, :3], poses[:, :, :3, 3]
-        # A joint's axis is its frame's z; the velocity it gives to the point at the origin is
-        # p x z.
-        moments = _cross(p[:, 1:], R[:, 1:, :, 2])
-        first = len(self._s)
-        self._s, self._q = np.concatenate([self._s, s]), np.concatenate([self._q, q])
-        self._R, self._p = np.concatenate([self._R, R]), np.concatenate([self._p, p])
-        self._moments = np.concatenate([self._moments, moments])
-        unknown = np.full((len(s), self._distances.shape[1]), np.nan)
-        self._distances = np.concatenate([self._distances, unknown])
-        return np.arange(first, len(self._s))
 
     def _note(self, bound: Array, pair: Index) -> None:
         """Keep the least of the bounds `(k,)` proved for pairs."""
@@ -197,77 +211,53 @@ class _Search:
         shape = *knots.shape, 1 + chord.shape[1], 3
         spin, drift = np.zeros(shape), np.zeros(shape)
         chord = chord[:, :, None]
-        np.cumsum(self._R[knots, 1:, :, 2] * chord, 2, out=spin[:, :, 1:])
-        np.cumsum(self._moments[knots] * chord, 2, out=drift[:, :, 1:])
+        np.cumsum(self._knots.turns[knots] * chord, 2, out=spin[:, :, 1:])
+        np.cumsum(self._knots.moments[knots] * chord, 2, out=drift[:, :, 1:])
         return spin, drift
-
-    def _near(self, knots: Index) -> tuple[Index, Index, Index]:
-        """The intervals between knots and the pairs that spheres and boxes don't keep apart."""
-        bounds, lo, hi = self._bounds, knots[:-1], knots[1:]
-        if not len(bounds.members):
-            return lo[:0], lo[:0], lo[:0]
-        ja, jb = bounds.joint_a, bounds.joint_b
-        centre, apart = bounds.rough_distances(self._R[knots], self._p[knots])
-        chord = self._q[hi] - self._q[lo]
-        spin, drift = self._twists(chord, np.stack([lo, hi]))
-        turn = spin[:, :, ja] - spin[:, :, jb]
-        move = _cross(turn, np.stack([centre[:-1], centre[1:]]))
-        move += drift[:, :, ja] - drift[:, :, jb]
-        fast = _norm(move) + _norm(turn) * bounds.radii
-        speed = 0.5 * np.maximum.reduceat(fast, bounds.starts, axis=2).sum(0)
-        bulge = self._path.bulge(self._s[lo], self._s[hi])
-        mu = speed + _excess(chord[:, None], bulge[:, None], bounds.reach)
-        bound = (apart[:-1] + apart[1:] - mu) / 2
-        open_ = bound < max(self._margin, _FAR)
-        self._note(np.where(open_, np.inf, bound).min(0), np.array([m[0] for m in bounds.members]))
-        intervals, groups = np.nonzero(open_)
-        pairs = [bounds.members[group] for group in groups]
-        counts = [len(each) for each in pairs]
-        pair = np.concatenate([np.zeros(0, np.intp), *pairs])
-        return np.repeat(lo[intervals], counts), np.repeat(hi[intervals], counts), pair
 
     def _motion(self, lo: Index, hi: Index, pair: Index) -> tuple[Array, Array]:
         """For pairs on intervals: mu `(k,)` [m], and what spheres and boxes prove `(k,)` [m]."""
-        bounds = self._bounds
+        bounds, at = self._placed.bounds, self._knots
         starts, ends, interval = _intervals(lo, hi)
-        chord = self._q[ends] - self._q[starts]
-        ja, jb = bounds.pair_a[pair], bounds.pair_b[pair]
+        chord = at.q[ends] - at.q[starts]
+        ja, jb = bounds.joint_a[pair], bounds.joint_b[pair]
         spin, drift = self._twists(chord, np.stack([starts, ends]))
-        of = np.stack([lo, hi])
-        centre = np.einsum("ekij,kj->eki", self._R[of, ja], bounds.pair_centres[pair])
-        centre += self._p[of, ja]
+        of, a, b = np.stack([lo, hi]), bounds.first[pair], bounds.second[pair]
+        centres = at.centres[of, a]
         turn = spin[:, interval, ja] - spin[:, interval, jb]
-        move = _cross(turn, centre) + drift[:, interval, ja] - drift[:, interval, jb]
-        mu = 0.5 * (_norm(move) + _norm(turn) * bounds.pair_radii[pair]).sum(0)
-        bulge = self._path.bulge(self._s[starts], self._s[ends])
-        mu += _excess(chord[interval], bulge[interval], bounds.pair_reach[pair])
-        apart = bounds.rough_pair_distances(centre, self._R[of, jb], self._p[of, jb], pair)
+        move = _cross(turn, centres) + drift[:, interval, ja] - drift[:, interval, jb]
+        mu = 0.5 * (norms(move) + norms(turn) * bounds.radii[pair]).sum(0)
+        bulge = self._path.bulge(at.s[starts], at.s[ends])
+        mu += _excess(chord[interval], bulge[interval], bounds.reach[pair])
+        apart = bounds.rough_distances(centres, at.axes[of, b], at.middles[of, b], pair)
         return mu, (apart.sum(0) - mu) / 2
 
     def _exact(self, knots: Index, pair: Index) -> Array:
         """Distances [m] of pairs at knots, each computed once."""
-        asked = np.zeros(self._distances.shape, bool)
+        known = self._knots.distances
+        asked = np.zeros(known.shape, bool)
         asked[knots, pair] = True
-        asked &= np.isnan(self._distances)
+        asked &= np.isnan(known)
         for knot in np.flatnonzero(asked.any(1)):
             pairs = np.flatnonzero(asked[knot])
-            self._distances[knot, pairs] = self._placed.pair_distances(
-                self._q[knot], pairs.tolist()
-            )
+            known[knot, pairs] = self._placed.pair_distances(self._knots.q[knot], pairs.tolist())
             self._checks += len(pairs)
-        return np.asarray(self._distances[knots, pair])
+        return np.asarray(known[knots, pair])
 
     def _bisect(self, lo: Index, hi: Index, pair: Index) -> tuple[Index, Index, Index]:
         starts, ends, interval = _intervals(lo, hi)
-        mid = self._add_knots((self._s[starts] + self._s[ends]) / 2)[interval]
+        middles = (self._knots.s[starts] + self._knots.s[ends]) / 2
+        mid = len(self._knots.s) + interval
+        self._knots = self._knots.and_then(_Knots.at(self._placed, self._path, middles))
         return np.concatenate([lo, mid]), np.concatenate([mid, hi]), np.concatenate([pair, pair])
 
     def _first_hit(self) -> Certificate:
         """The collision found nearest to the path's start."""
-        hits = (self._distances < self._margin).any(1)
-        knot = min(np.flatnonzero(hits), key=lambda each: self._s[each])
-        k = int(np.nanargmin(self._distances[knot]))
-        return self._certificate("collision", self._s[knot], k, self._distances[knot, k])
+        known = self._knots.distances
+        hits = np.flatnonzero((known < self._margin).any(1))
+        knot = hits[np.argmin(self._knots.s[hits])]
+        k = int(np.nanargmin(known[knot]))
+        return self._certificate("collision", self._knots.s[knot], k, known[knot, k])
 
     def _certificate(
         self,
@@ -303,7 +293,3 @@ def _excess(chord: Array, bulge: Array, reach: Array) -> Array:
 def _cross(a: Array, b: Array) -> Array:
     """The cross product over the last axis; NumPy's own takes five times as long here."""
     return np.asarray(a[..., _YZX] * b[..., _ZXY] - a[..., _ZXY] * b[..., _YZX])
-
-
-def _norm(vectors: Array) -> Array:
-    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))

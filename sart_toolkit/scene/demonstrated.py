@@ -14,6 +14,10 @@ from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scene.collision import CollisionModel, PlacedModel
 from sart_toolkit.scene.spec import SceneSpec
 
+# What is carried moves in the grasp: by 2 to 4 mm in PyBullet, by 0.2 mm in SAPIEN. A segment on
+# which it moves farther is rejected.
+GRASP_PLAY = 0.005
+
 
 @dataclass(frozen=True)
 class Phase:
@@ -59,8 +63,21 @@ class DemonstratedScene:
         phases: the phase of each waypoint.
     """
 
-    def __init__(self, demonstration: Demonstration, robot: RobotSpec, scene: SceneSpec) -> None:
+    def __init__(
+        self,
+        demonstration: Demonstration,
+        robot: RobotSpec,
+        scene: SceneSpec,
+        grasp_play: float = GRASP_PLAY,
+    ) -> None:
         """Read the geometry of robot and scene.
+
+        Args:
+            demonstration: what was shown.
+            robot: the robot that was steered.
+            scene: the task's scene.
+            grasp_play: how far [m] what is carried may move in the grasp; that much more is kept
+                clear of it.
 
         Raises:
             Mismatch: the demonstration doesn't tell where the scene's bodies were.
@@ -73,6 +90,7 @@ class DemonstratedScene:
                 "proved about it; record it on a backend that observes bodies"
             )
         self.demonstration = demonstration
+        self.grasp_play = grasp_play
         self.collision = CollisionModel(robot, scene)
         self.phases = demonstration_phases(demonstration, robot, scene)
         self._placed: dict[int, PlacedModel] = {}
@@ -85,5 +103,7 @@ class DemonstratedScene:
             T_tool_world = inverse(steps.measured_Ts_world_tool[t])
             carried = {name: T_tool_world @ Ts[name] for name in self.phases[t].carried}
             gripper = float(np.clip(steps.measured_gripper[t], 0.0, 1.0))
-            self._placed[t] = self.collision.placed(Ts, gripper, carried)
+            self._placed[t] = self.collision.placed(
+                Ts, gripper, carried, grasp_play=self.grasp_play
+            )
         return self._placed[t]

@@ -18,12 +18,12 @@ from sart_toolkit.scene.cloud import (
     fuse_cloud,
 )
 from sart_toolkit.scene.collision import CollisionModel, ConvexPart, PlacedModel
-from sart_toolkit.scene.demonstrated import demonstration_phases
+from sart_toolkit.scene.demonstrated import GRASP_PLAY, demonstration_phases
 from sart_toolkit.scene.obstacles import CloudObstacles, hull_part
 from sart_toolkit.scene.spec import SceneSpec
 from sart_toolkit.teach.suggest import Gap, SuggestConfig, Suggestion
 
-_OBSTACLE = "cloud"
+_OBSTACLE, _CARRIED = "cloud", "carried"
 # Support is looked for within this distance [m] of an object, from above.
 _BESIDE = 0.03
 
@@ -42,6 +42,7 @@ class CloudSurroundings:
         robot: RobotSpec,
         scene: SceneSpec,
         config: CloudConfig | None = None,
+        grasp_play: float = GRASP_PLAY,
     ) -> None:
         """Look at the pictures of a demonstration.
 
@@ -51,12 +52,14 @@ class CloudSurroundings:
             scene: tells what is fixed to the robot and which bodies can be lifted; where its bodies
                 are and what shape they have is not looked at.
             config: how pictures become a cloud.
+            grasp_play: how far [m] what is carried may move in the grasp.
 
         Raises:
             InvalidInput: the demonstration holds no depth pictures.
         """
         self._demonstration, self._robot, self._held = demonstration, robot, scene.held
         self._config = config or CloudConfig()
+        self._grasp_play = grasp_play
         alone = SceneSpec((), scene.held)
         self._collision = CollisionModel(robot, alone)
         self.kinematics = self._collision.kinematics
@@ -118,26 +121,27 @@ class CloudSurroundings:
         return self._obstacles[run]
 
     @functools.cache  # noqa: B019 - as long as the demonstration's waypoints
-    def _placed(self, t: int) -> PlacedModel:
+    def placed(self, t: int) -> PlacedModel:
+        """The robot as at waypoint `t`, without a scene."""
         gripper = float(np.clip(self._demonstration.steps.measured_gripper[t], 0.0, 1.0))
         return self._collision.placed({}, round(gripper, 2))
 
     @functools.cache  # noqa: B019 - as long as the demonstration's waypoints
     def _parts(self, t: int) -> list[ConvexPart]:
         """The robot's moving parts at a waypoint, and the hull of what is carried."""
-        placed = self._placed(t)
+        placed = self.placed(t)
         parts = [part for part in placed.parts if part.joint > 0]
         _, carried = self._seen(t)
         if carried is not None:
             T = placed.T_joint_tool
             points = carried.points @ T[:3, :3].T + T[:3, 3]
-            parts.append(hull_part("carried", len(self._robot.arm_joints), points))
+            parts.append(hull_part(_CARRIED, len(self._robot.arm_joints), points))
         return parts
 
     def proved(self, t: int, config: SuggestConfig) -> Suggestion:
         """The largest radius about waypoint `t` that keeps the tool clear of all that was seen."""
         obstacles, _ = self._seen(t)
-        placed = self._placed(t)
+        placed = self.placed(t)
         T_joint = placed.joint_poses(self._demonstration.steps.joint_positions[t])[-1]
         p_tool = (T_joint @ placed.T_joint_tool)[:3, 3]
         best = Suggestion(config.max_radius, None, "max_radius")
@@ -147,7 +151,7 @@ class CloudSurroundings:
             reach = float(np.linalg.norm(part.points - placed.T_joint_tool[:3, 3], axis=1).max())
             closest = obstacles.distances(part, T_joint, 0.0)
             if closest:
-                nearest.append((closest[0].distance, reach, part))
+                nearest.append((closest[0].distance - self._play(part), reach, part))
         nearest.sort(key=lambda row: row[0])
         for apart, reach, part in nearest:
             if best.clearance is None:
@@ -158,21 +162,35 @@ class CloudSurroundings:
                 continue
             points = part.points @ T_joint[:3, :3].T + T_joint[:3, 3] - p_tool
             for found in obstacles.distances(part, T_joint, within):
-                support = float(found.normal @ (found.p_cloud - p_tool)) + self._config.inflation
-                gap = Gap(found.body, _OBSTACLE, found.distance, found.normal, points, support)
+                play = self._play(part)
+                support = float(found.normal @ (found.p_cloud - p_tool))
+                gap = Gap(
+                    found.body,
+                    _OBSTACLE,
+                    found.distance - play,
+                    found.normal,
+                    points,
+                    support + self._config.inflation + play,
+                )
                 best = gap.limited(best, config)
         return best
 
     def too_close(self, t: int, q: Array, margin: float) -> str | None:
         """The names of a pair, the robot whole and the scene as seen, nearer than the margin."""
-        placed = self._placed(t)
+        placed = self.placed(t)
         pair = placed.too_close(q, margin)
         if pair is not None:
             return " / ".join(pair)
         poses = placed.joint_poses(q)
         obstacles, _ = self._seen(t)
-        body = obstacles.any_within([(part, poses[part.joint]) for part in self._parts(t)], margin)
-        return None if body is None else f"{body} / {_OBSTACLE}"
+        for part in self._parts(t):
+            if obstacles.any_within([(part, poses[part.joint])], margin + self._play(part)):
+                return f"{part.body} / {_OBSTACLE}"
+        return None
+
+    def _play(self, part: ConvexPart) -> float:
+        """How far [m] a part may move in the grasp."""
+        return self._grasp_play if part.body == _CARRIED else 0.0
 
     def moving(self, t: int) -> str | None:
         """Always `None`: pictures of one moment don't tell what moves."""

@@ -21,6 +21,7 @@ from sart_toolkit.records import (
     convergence_waypoint,
 )
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.collision import PlacedModel
 from sart_toolkit.scene.demonstrated import DemonstratedScene, Phase
 
 _BISECTIONS = 40
@@ -33,6 +34,10 @@ _LEAST_SINGULAR_VALUE = 0.03
 _LARGEST_STEP = 1.5
 # What moves no farther than this in 0.2 s stands still [m, deg].
 _STILL, _STILL_DEG = 0.0005, 0.2
+# Pairs without a proof keep this [m] more at the draws that are aimed at them.
+_ARM_MARGIN = 0.005
+# By this many radii, at most, two bodies come nearer within a sphere; by half that usually.
+_STEEPEST = 5.0
 # A sphere of this radius [m] or more is probed in full, the smallest at a quarter of the poses.
 _WIDE, _FEWEST_PROBES = 0.06, 0.25
 
@@ -173,6 +178,9 @@ class Surroundings(Protocol):
     kinematics: RobotModel
     phases: tuple[Phase, ...]
 
+    def placed(self, t: int) -> PlacedModel:
+        """The robot, and what else of the scene is known exactly, as at waypoint `t`."""
+
     def proved(self, t: int, config: SuggestConfig) -> Suggestion:
         """The largest radius about waypoint `t` for which the tool is proved clear of obstacles."""
 
@@ -192,6 +200,10 @@ class ExactSurroundings:
         self.kinematics = scene.collision.kinematics
         self.phases = scene.phases
 
+    def placed(self, t: int) -> PlacedModel:
+        """Robot and scene as at waypoint `t`."""
+        return self._scene.placed(t)
+
     def gaps(self, t: int) -> Iterator[Gap]:
         """Tool parts and obstacles at waypoint `t`, nearest first."""
         placed = self._scene.placed(t)
@@ -208,7 +220,7 @@ class ExactSurroundings:
             # Bodies that touch have no plane between them; nothing fits then.
             normal = normal / length if length > 1e-9 else np.zeros(3)
             points = part.points @ T_joint[:3, :3].T + T_joint[:3, 3] - p_tool
-            support = float(normal @ (found.p_b - p_tool))
+            support = float(normal @ (found.p_b - p_tool)) + float(placed.play[pairs[i]])
             yield Gap(found.a, found.b, found.distance, normal, points, support)
 
     def proved(self, t: int, config: SuggestConfig) -> Suggestion:
@@ -284,8 +296,10 @@ def suggest_radius(
     best = surroundings.proved(t, config)
     if room is not None and room.radius < best.radius:
         best = dataclasses.replace(room, clearance=best.clearance)
+    q_key = demonstration.steps.joint_positions[t]
+    threats = _threats(surroundings.placed(t), q_key, _STEEPEST * best.radius + _ARM_MARGIN)
     while best.radius >= config.min_radius:
-        problem = _probe(surroundings, demonstration, t, best.radius, config)
+        problem = _probe(surroundings, demonstration, t, best.radius, config, threats)
         if problem is None:
             return best
         best = Suggestion(best.radius * _SHRINK, best.clearance, problem)
@@ -298,6 +312,7 @@ def _probe(
     t: int,
     radius: float,
     config: SuggestConfig,
+    threats: Sequence[_Threat],
 ) -> str | None:
     """What goes wrong at one of the extreme poses of a radius, or at its t*; or None."""
     steps, model = demonstration.steps, surroundings.kinematics
@@ -309,23 +324,115 @@ def _probe(
     pair = surroundings.too_close(t_star, steps.commanded_joint_positions[t_star], config.margin)
     if pair is not None:
         return f"{pair} at waypoint {t_star}"
-    angle = config.rotation_per_metre * radius
+    reached = functools.partial(_reached, model, T_key, q_key, radius, config)
+    problem = _directed(surroundings.placed(t), threats, q_key, radius, config, reached)
+    if problem is not None:
+        return problem
     # The arm hardly moves in a small sphere.
     count = int(np.ceil(config.probes * min(1.0, max(radius / _WIDE, _FEWEST_PROBES))))
     for direction, axis in _directions(count):
-        T = T_key @ pose(rotvec=angle * axis)
-        T[:3, 3] = T_key[:3, 3] + radius * direction
-        try:
-            q = model.ik(T, q_key, _LARGEST_STEP)
-        except (Unreachable, MotionRejected):
-            return "reach"
-        if min((q - model.lower).min(), (model.upper - q).min()) < _JOINT_MARGIN:
-            return "joint limit"
-        if np.linalg.svd(model.jacobian(q), compute_uv=False)[-1] < _LEAST_SINGULAR_VALUE:
-            return "singularity"
+        q = reached(direction, axis)
+        if isinstance(q, str):
+            return q
         pair = surroundings.too_close(t, q, config.margin)
         if pair is not None:
             return pair
+    return None
+
+
+def _reached(
+    model: RobotModel,
+    T_key: Array,
+    q_key: Array,
+    radius: float,
+    config: SuggestConfig,
+    direction: Array,
+    axis: Array,
+) -> Array | str:
+    """Joints `(n,)` for the extreme pose in a direction, turned about an axis; or what forbids it.
+
+    `direction (3,)` is in the world, `axis (3,)` in the tool frame; both are unit vectors.
+    """
+    T = T_key @ pose(rotvec=config.rotation_per_metre * radius * axis)
+    T[:3, 3] = T_key[:3, 3] + radius * direction
+    try:
+        q = model.ik(T, q_key, _LARGEST_STEP)
+    except (Unreachable, MotionRejected):
+        return "reach"
+    if min((q - model.lower).min(), (model.upper - q).min()) < _JOINT_MARGIN:
+        return "joint limit"
+    if np.linalg.svd(model.jacobian(q), compute_uv=False)[-1] < _LEAST_SINGULAR_VALUE:
+        return "singularity"
+    return q
+
+
+@dataclass(frozen=True)
+class _Threat:
+    """Two bodies without a proof: their nearest pair by index, how the tool's motion changes it.
+
+    `distance` [m] is that at the waypoint, `slope (6,)` its gradient by the tool's motion (linear,
+    then turning [m/rad]) in the tool frame.
+    """
+
+    names: tuple[str, str]
+    pair: int
+    distance: float
+    slope: Array
+
+    @staticmethod
+    def of(placed: PlacedModel, pair: int, distance: float, q: Array) -> _Threat:
+        # The tool's motion is J dq.
+        slope = np.linalg.solve(placed.kinematics.jacobian(q).T, placed.gradient(q, pair))
+        return _Threat(placed.names(pair), pair, distance, np.asarray(slope, dtype=np.float64))
+
+
+def _threats(placed: PlacedModel, q_key: Array, within: float) -> list[_Threat]:
+    """Every two bodies `within` [m] that have no proof, arm against arm, say, as at a waypoint."""
+    proved = set(placed.tool_pairs())
+    unproved = [k for k in range(len(placed.pairs)) if k not in proved]
+    distances = dict(zip(unproved, placed.pair_distances(q_key, unproved), strict=True))
+    nearest: dict[tuple[str, str], int] = {}
+    for k in sorted(unproved, key=lambda k: distances[k], reverse=True):
+        nearest[placed.names(k)] = k
+    near = [k for k in nearest.values() if distances[k] <= within]
+    return [_Threat.of(placed, k, distances[k], q_key) for k in near]
+
+
+def _directed(
+    placed: PlacedModel,
+    threats: Sequence[_Threat],
+    q_key: Array,
+    radius: float,
+    config: SuggestConfig,
+    reached: Callable[[Array, Array], Array | str],
+) -> str | None:
+    """The names of a pair that a draw aimed at it brings too close, or what else forbids it.
+
+    Tried are the draw that brings a pair nearest by its distance's gradient at the waypoint, and
+    the one that does so by the gradient found there.
+    """
+    angle = config.rotation_per_metre * radius
+    for threat in threats:
+        q = q_key
+        for again in range(2):
+            if again:
+                threat = _Threat.of(placed, threat.pair, threat.distance, q)
+            straight, turning = (
+                float(np.linalg.norm(each)) for each in (threat.slope[:3], threat.slope[3:])
+            )
+            # Nowhere near, even if it all got twice as steep.
+            if threat.distance > 2 * (straight * radius + turning * angle) + _ARM_MARGIN:
+                break
+            R = placed.kinematics.fk(q)[:3, :3]
+            found = reached(
+                -R @ threat.slope[:3] / max(straight, 1e-12),
+                -threat.slope[3:] / max(turning, 1e-12),
+            )
+            if isinstance(found, str):
+                return found
+            q = found
+            if placed.pair_distances(q, [threat.pair])[0] < config.margin + _ARM_MARGIN:
+                return " / ".join(threat.names)
     return None
 
 

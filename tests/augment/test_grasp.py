@@ -6,7 +6,6 @@ import functools
 import numpy as np
 import pytest
 
-from sart_toolkit.augment import segments
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.segments import KEPT, SegmentMaker
 from sart_toolkit.backends import BACKENDS, make_backend
@@ -139,12 +138,10 @@ def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
     assert "path too close toolbox / table" in outcomes
 
 
-def test_a_segment_on_which_the_object_slips_is_rejected(
-    backend, model, shown, annotation, monkeypatch
-):
-    monkeypatch.setattr(segments, "_SLIP", 0.0)
+def test_a_segment_on_which_the_object_slips_is_rejected(backend, shown, annotation):
     i = len(annotation.spheres) - 1
-    attempt = SegmentMaker(backend, shown, annotation, AugmentConfig(n=8))(i, 0)
+    config = AugmentConfig(n=8, grasp_play=0.0)
+    attempt = SegmentMaker(backend, shown, annotation, config)(i, 0)
     assert attempt.outcome == "toolbox slipped in the grasp"
     assert attempt.episode is None
 

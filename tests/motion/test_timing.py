@@ -1,4 +1,4 @@
-"""Courses in time: from rest to rest, brisk, within every joint's limits, and no slower than asked."""
+"""Courses in time: from rest to rest, brisk, within all joints' limits, no slower than asked."""
 
 import functools
 

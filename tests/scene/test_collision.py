@@ -251,7 +251,7 @@ def test_no_distance_changes_by_more_than_the_joints_between_can_move_it(
     q = joints_near(placed, rng)
     dq = step * rng.uniform(-1, 1, 6) * (rng.random(6) < 0.4)
     change = np.abs(placed.distances(q + dq) - placed.distances(q))
-    assert (change <= placed.bounds.pair_reach @ np.abs(dq) + ACCURACY).all()
+    assert (change <= placed.bounds.reach @ np.abs(dq) + ACCURACY).all()
 
 
 def test_distances_only_grow_when_the_scene_moves_away_below(start):
@@ -402,11 +402,9 @@ def test_no_point_is_farther_from_a_joint_than_the_reach(cluttered, seed, kind):
         part = placed.parts[firsts[k]]
         T = joints[part.joint]
         points = part.points @ T[:3, :3].T + T[:3, 3]
-        for joint in range(bounds.pair_b[k] + 1, bounds.pair_a[k] + 1):
+        for joint in range(bounds.joint_b[k] + 1, bounds.joint_a[k] + 1):
             far = np.linalg.norm(points - joints[joint][:3, 3], axis=1).max()
-            assert far <= bounds.pair_reach[k, joint - 1] + 1e-9
-    for group, members in enumerate(bounds.members):
-        assert (bounds.reach[group] >= bounds.pair_reach[members]).all()
+            assert far <= bounds.reach[k, joint - 1] + 1e-9
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -681,9 +679,14 @@ def test_distances_are_those_of_pybullet(robot, peg_task, rng):
 # --- quick bounds -------------------------------------------------------------------------------
 
 
-def rough(placed, q):
-    T = placed.joint_poses(q)[None]
-    return placed.bounds.rough_distances(T[:, :, :3, :3], T[:, :, :3, 3])
+def rough_distances(placed, q):
+    """What spheres and boxes say of each pair's distance."""
+    bounds = placed.bounds
+    centres, axes, middles = (each[0] for each in bounds.placed(placed.joint_poses(q)[None]))
+    every = np.arange(len(placed.pairs))
+    return bounds.rough_distances(
+        centres[bounds.first], axes[bounds.second], middles[bounds.second], every
+    )
 
 
 def assert_not_above(rough, exact):
@@ -697,52 +700,75 @@ def assert_not_above(rough, exact):
 @settings(PROPERTY, max_examples=100)
 @given(seed=seeds, kind=kinds, spread=st.sampled_from([0.3, 1.5, 6]))
 def test_rough_distances_are_never_above_true_ones(cluttered, seed, kind, spread):
-    placed, rng = cluttered[kind], np.random.default_rng(seed)
-    q = joints_near(placed, rng, spread)
-    distances, bounds = placed.distances(q), placed.bounds
-    _, groups = rough(placed, q)
-    assert sorted(np.concatenate(bounds.members)) == list(range(len(placed.pairs)))
-    assert_not_above(groups[0], np.array([distances[pairs].min() for pairs in bounds.members]))
-    T = placed.joint_poses(q)
-    pairs = np.arange(len(placed.pairs))
-    a, b = bounds.pair_a, bounds.pair_b
-    centres = np.einsum("kij,kj->ki", T[a, :3, :3], bounds.pair_centres) + T[a, :3, 3]
-    each = bounds.rough_pair_distances(centres, T[b, :3, :3], T[b, :3, 3], pairs)
-    assert_not_above(each, distances)
+    placed = cluttered[kind]
+    q = joints_near(placed, np.random.default_rng(seed), spread)
+    rough, distances = rough_distances(placed, q), placed.distances(q)
+    assert_not_above(rough, distances)
     # They are of use: they tell apart most of what is far.
-    assert (each > 0.01).sum() > 0.6 * (distances > 0.1).sum()
+    assert (rough > 0.01).sum() > 0.6 * (distances > 0.1).sum()
 
 
 @PROPERTY
-@given(seed=seeds, carried=st.booleans())
-def test_rough_distances_are_never_above_true_ones_whatever_is_carried(rods, seed, carried):
+@given(seed=seeds, carried=st.booleans(), play=st.sampled_from([0.0, 0.02]))
+def test_rough_distances_are_never_above_true_ones_whatever_is_carried(rods, seed, carried, play):
     rng = np.random.default_rng(seed)
     Ts = {"wire": random_pose(rng, 0.6), "rod": random_pose(rng, 0.6)}
-    placed = rods.placed(Ts, rng.uniform(), {"rod": random_pose(rng, 0.3)} if carried else None)
+    in_grasp = {"rod": random_pose(rng, 0.3)} if carried else None
+    placed = rods.placed(Ts, rng.uniform(), in_grasp, grasp_play=play)
     q = joints_near(placed, rng)
-    distances = placed.distances(q)
-    _, groups = rough(placed, q)
-    exact = np.array([distances[pairs].min() for pairs in placed.bounds.members])
-    assert_not_above(groups[0], exact)
+    assert_not_above(rough_distances(placed, q), placed.distances(q))
 
 
 @pytest.mark.parametrize("kind", ["boxes", "rods", "shelf", "mixed"])
 def test_spheres_and_boxes_enclose_what_they_stand_for(cluttered, kind, rng):
     placed = cluttered[kind]
-    bounds, parts = placed.bounds, placed.parts
-    rows = np.split(np.arange(len(bounds.radii)), bounds.starts[1:])
-    for of_group, members in zip(rows, bounds.members, strict=True):
-        for i, j in placed.pairs[members]:
-            a, b = parts[i], parts[j]
-            # Points of the hull, not its corners alone: spheres side by side enclose all of it.
-            weights = rng.dirichlet(np.full(len(a.points), 0.1), 30)
-            points = np.concatenate([a.points, weights @ a.points])
-            to_centres = np.linalg.norm(points[:, None] - bounds.centres[of_group], axis=2)
-            assert (to_centres - bounds.radii[of_group]).min(1).max() < 1e-9
-            row = of_group[0]
-            assert (bounds.joint_a[row], bounds.joint_b[row]) == (a.joint, b.joint)
-            local = (b.points - bounds.p_box[row]) @ bounds.R_box[row]
-            assert (np.abs(local) <= bounds.half[row] + 1e-9).all()
+    bounds = placed.bounds
+    q = joints_near(placed, rng)
+    centres, axes, middles = (each[0] for each in bounds.placed(placed.joint_poses(q)[None]))
+    world = [
+        part.points @ T[:3, :3].T + T[:3, 3]
+        for part, (_, T) in zip(placed.parts, poses_of_parts(placed, q), strict=True)
+    ]
+    for k, (i, j) in enumerate(placed.pairs):
+        assert (bounds.joint_a[k], bounds.joint_b[k]) == (
+            placed.parts[i].joint, placed.parts[j].joint
+        )  # fmt: skip
+        to_centre = np.linalg.norm(world[i] - centres[i], axis=1)
+        assert to_centre.max() <= bounds.radii[k] + 1e-9
+        local = (world[j] - middles[j]) @ axes[j].T
+        assert (np.abs(local) <= bounds.half[k] + 1e-9).all()
+
+
+# --- play in the grasp --------------------------------------------------------------------------
+
+
+@PROPERTY
+@given(seed=seeds, play=st.floats(0, 0.02))
+def test_all_that_is_carried_is_nearer_by_its_play_and_nothing_else_is(rods, seed, play):
+    rng = np.random.default_rng(seed)
+    Ts, T_tool_rod = {"wire": random_pose(rng, 0.6)}, random_pose(rng, 0.3)
+    tight = rods.placed(Ts, 0.2, {"rod": T_tool_rod})
+    loose = rods.placed(Ts, 0.2, {"rod": T_tool_rod}, grasp_play=play)
+    q = joints_near(loose, rng)
+    carried = np.array([loose.names(k)[0] == "rod" for k in range(len(loose.pairs))])
+    assert 0 < carried.sum() < len(carried)
+    expected = tight.distances(q) - play * carried
+    np.testing.assert_allclose(loose.distances(q), expected, rtol=0, atol=ACCURACY)
+    every = list(range(len(loose.pairs)))
+    np.testing.assert_allclose(loose.pair_distances(q, every), expected, rtol=0, atol=ACCURACY)
+    assert loose.nearest(q).distance == pytest.approx(expected.min(), abs=ACCURACY)
+    k = int(np.flatnonzero(carried)[0])
+    assert loose.witness(q, k).distance == pytest.approx(expected[k], abs=ACCURACY)
+    margin = expected.min() + 1e-4
+    if margin > 0:
+        assert loose.too_close(q, margin) is not None
+        assert loose.too_close(q, max(margin - 2e-4, 0.0)) is None or expected.min() < 0
+
+
+@pytest.mark.parametrize("play", [-1e-6, np.nan, np.inf])
+def test_a_play_that_is_negative_or_not_finite_is_refused(rods, play):
+    with pytest.raises(InvalidInput, match="grasp_play: expected a finite number >= 0 m, got"):
+        rods.placed({"wire": FAR}, 0.0, {"rod": np.eye(4)}, grasp_play=play)
 
 
 # --- other questions ----------------------------------------------------------------------------
