@@ -15,9 +15,9 @@ PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c const
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /\t/' | expand -t 12
 
-setup: $(VENV)/.setup ## install the toolkit, both simulators and what the tests need into .venv
+setup: $(VENV)/.setup ## install the toolkit, simulators, planner and what the tests need into .venv
 
-setup-all: $(VENV)/.setup-all ## add the annotation window and planning, with their Debian libraries
+setup-all: $(VENV)/.setup-all ## add the annotation window with its Debian libraries
 
 demo: setup ## learn peg-in-hole from one demonstration and write a report
 	$(BIN)/sart run peg_in_hole --out $(DEMO_OUT)
@@ -46,10 +46,10 @@ $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
 	        "$$($(PYTHON) --version 2>&1). Type: make $(MAKECMDGOALS)" \
 	        "PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(PIP_INSTALL) -e '.[dev,sapien]'
+	$(PIP_INSTALL) -e '.[dev,sapien,planning]'
 	@touch $@
 
 $(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh
 	bash tools/setup_debian.sh annotate
-	$(PIP_INSTALL) -e '.[dev,sapien,annotate,planning]'
+	$(PIP_INSTALL) -e '.[dev,sapien,planning,annotate]'
 	@touch $@

@@ -73,6 +73,7 @@ def library_versions() -> dict[str, str]:
         "pin",
         "coal",
         "ruckig",
+        "ompl",
         "pybullet",
         "sapien",
         "torch",

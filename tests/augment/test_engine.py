@@ -56,6 +56,8 @@ def crowded_dataset(peg_demonstration, crowded, make_peg_backend, tmp_path_facto
 def strategy_dataset(
     request, peg_demonstration, peg_annotation, make_peg_backend, tmp_path_factory
 ):
+    if STRATEGIES[request.param].plans:
+        pytest.importorskip("ompl")
     out = tmp_path_factory.mktemp(request.param) / "dataset"
     config = AugmentConfig(n=9, strategy=request.param)
     return augment_demonstration(peg_demonstration, peg_annotation, make_peg_backend, out, config)

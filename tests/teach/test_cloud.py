@@ -11,7 +11,7 @@ from sart_toolkit.poses import pose
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scene.cloud import CloudConfig
-from sart_toolkit.scene.demonstrated import DemonstratedScene
+from sart_toolkit.scene.demonstrated import GRASP_PLAY, DemonstratedScene
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.teach.cloud import CloudSurroundings
@@ -84,7 +84,12 @@ def test_what_was_lifted_reaches_down_to_where_it_stood(toolbox):
     heights = toolbox.demonstration.body_Ts_world["toolbox"][:, 2, 3]
     rest = heights[0]
     last = len(toolbox.demonstration) - 3
-    found = suggest_radius(toolbox.cloud, toolbox.demonstration, last)
+    rigid = CloudSurroundings(
+        toolbox.demonstration, toolbox.robot, toolbox.task.scene, grasp_play=0.0
+    )
+    found = suggest_radius(rigid, toolbox.demonstration, last)
+    loose = suggest_radius(toolbox.cloud, toolbox.demonstration, last)
+    assert found.clearance == pytest.approx(loose.clearance + GRASP_PLAY, abs=2e-6)
     lifted = heights[last] - rest
     assert found.clearance == pytest.approx(lifted, abs=0.006)
     assert found.clearance < lifted + 0.002

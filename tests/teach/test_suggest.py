@@ -181,23 +181,25 @@ def test_every_pose_that_augmentation_draws_keeps_the_whole_robot_clear(
 def test_a_little_larger_than_suggested_some_pose_would_touch(
     peg_demonstration, peg_scene, peg_annotation
 ):
-    """Straight towards the obstacle, and turned so that the nearest corner comes down."""
-    sphere = peg_annotation.spheres[1]
-    assert sphere.limited_by == "peg / block"
-    placed = peg_scene.placed(sphere.waypoint)
-    gap = next(ExactSurroundings(peg_scene).gaps(sphere.waypoint))
-    grown = 1.15 * sphere.radius
-    lowest = gap.points[np.argmin(gap.points @ gap.normal)]
-    axis = np.cross(lowest, gap.normal)
-    T = sphere.T_world_key.copy()
-    for sign in (1, -1):
-        turn = sign * 2.0 * grown * axis / max(np.linalg.norm(axis), 1e-12)
-        T[:3, :3] = pose(rotvec=turn)[:3, :3] @ sphere.T_world_key[:3, :3]
-        T[:3, 3] = sphere.T_world_key[:3, 3] - grown * gap.normal
+    """Draws about straight towards the obstacle, turned so that a near corner comes down."""
+    rng = np.random.default_rng(0)
+    for sphere in peg_annotation.spheres[:3]:
+        assert sphere.limited_by == "peg / block"
+        placed = peg_scene.placed(sphere.waypoint)
         near = peg_demonstration.steps.joint_positions[sphere.waypoint]
-        if placed.distances(placed.kinematics.ik(T, near)).min() < 0:
-            return
-    raise AssertionError("nothing touched")
+        gap = next(ExactSurroundings(peg_scene).gaps(sphere.waypoint))
+        corners = gap.points[np.argsort(gap.points @ gap.normal)[:4]]
+        grown, least = 1.15 * sphere.radius, np.inf
+        for _ in range(400):
+            axis = np.cross(corners[rng.integers(4)], gap.normal)
+            axis = axis / np.linalg.norm(axis) + rng.normal(0, 0.3, 3)
+            turn = rng.choice([-1, 1]) * 2.0 * grown * axis / np.linalg.norm(axis)
+            way = -gap.normal + rng.normal(0, 0.15, 3)
+            T = sphere.T_world_key.copy()
+            T[:3, :3] = pose(rotvec=turn)[:3, :3] @ T[:3, :3]
+            T[:3, 3] += grown * way / np.linalg.norm(way)
+            least = min(least, placed.distances(placed.kinematics.ik(T, near)).min())
+        assert least < 0, sphere
 
 
 def test_a_rotation_free_augmentation_gets_larger_spheres_and_a_margin_smaller_ones(
