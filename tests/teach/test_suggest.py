@@ -90,7 +90,9 @@ def test_by_a_plane_a_certified_radius_can_not_be_larger(points, distance, nu):
         across = np.array([x[1], -x[0], 0.0])
         # Straight above or below the origin any level axis does.
         across = across if np.linalg.norm(across) > 1e-9 else np.array([1.0, 0.0, 0.0])
-        across *= nu * grown / np.linalg.norm(across)
+        # Beyond straight down it would rise again.
+        left = np.pi - np.arccos(np.clip(x[2] / max(np.linalg.norm(x), 1e-12), -1, 1))
+        across *= min(nu * grown, left) / np.linalg.norm(across)
         for turn in (across, -across):
             lowest = min(lowest, (pose(rotvec=turn)[:3, :3] @ x)[2])
     assert lowest - grown - gap.support < 1e-9 + 1e-3 * distance
