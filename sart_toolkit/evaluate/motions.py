@@ -439,7 +439,9 @@ class SphereTrial:
     def __call__(self, sphere: PrecisionSphere, rng: np.random.Generator) -> dict[str, Any]:
         """What became of a sphere's draws, as JSON values; distances in millimetres.
 
-        `collisions` counts poses at which one of the two models of the whole robot overlaps.
+        `collisions` counts poses at which one of the two models of the whole robot overlaps, with
+        what is carried where it was in the grasp. `within_margin` tells whether a directed draw
+        came nearer than the margin, and the play in the grasp, that a suggested radius leaves.
         """
         t = sphere.waypoint
         self._place(t)
@@ -484,7 +486,7 @@ class SphereTrial:
             if q is None:
                 unreachable += 1
                 continue
-            distances = placed.distances(q)
+            distances = placed.distances(q) + placed.play
             nearest = int(np.argmin(distances))
             seen = self._checker.nearest(q)
             if distances[nearest] < least:
@@ -533,16 +535,15 @@ class SphereTrial:
                 q = self._joints(t, T)
                 found = (
                     q is not None
-                    and bool(placed.distances(q).min() < 0)
+                    and bool((placed.distances(q) + placed.play).min() < 0)
                     and self._checker.nearest(q).distance < 0
                 )
-        least = search.least
         return {
             "radius": radius,
             "draws": search.draws,
             "collided": found,
-            "least_mm": least * 1e3,
-            "within_margin": bool(least < self._config.suggest.margin),
+            "least_mm": search.least * 1e3,
+            "within_margin": bool(search.least_with_play < self._config.suggest.margin),
         }
 
 
@@ -580,6 +581,7 @@ class _Search:
                     T_tool_joint @ part.T_joint_part,
                     obstacle.geometry,
                     coal_transform(obstacle.T_joint_part),
+                    float(placed.play[k]),
                 )
             )
             witness = placed.witness(q_key, k)
@@ -593,7 +595,7 @@ class _Search:
                 self._aims.append((gap / length, points, weights / weights.sum()))
         self.draws = 0
         self._best = np.zeros(3), np.zeros(3)
-        self.least = float("inf")
+        self.least = self.least_with_play = float("inf")
 
     def draw(self) -> tuple[float, Array]:
         """The next draw: how far [m] the tool is from the scene there, and its pose `(4, 4)`."""
@@ -603,9 +605,13 @@ class _Search:
         T = np.array(self._T_key)
         T[:3, :3] = exp_rotation(w) @ T[:3, :3]
         T[:3, 3] += p
-        least = min(
-            convex_distance(a, coal_transform(T @ T_tool_part), b, T_b)
-            for a, T_tool_part, b, T_b in self._pairs
+        distances = [
+            (convex_distance(a, coal_transform(T @ T_tool_part), b, T_b), play)
+            for a, T_tool_part, b, T_b, play in self._pairs
+        ]
+        least = min(distance for distance, _ in distances)
+        self.least_with_play = min(
+            self.least_with_play, *(distance - play for distance, play in distances)
         )
         if least < self.least:
             self.least, self._best = least, (p, w)

@@ -406,7 +406,7 @@ def _directed(
     config: SuggestConfig,
     reached: Callable[[Array, Array], Array | str],
 ) -> str | None:
-    """The names of a pair that a draw aimed at it brings too close, or what else forbids it.
+    """The names of a pair that a draw aimed at it brings too close; None if there is none.
 
     Tried are the draw that brings a pair nearest by its distance's gradient at the waypoint, and
     the one that does so by the gradient found there.
@@ -429,7 +429,8 @@ def _directed(
                 -threat.slope[3:] / max(turning, 1e-12),
             )
             if isinstance(found, str):
-                return found
+                # What can't be reached can't collide.
+                break
             q = found
             if placed.pair_distances(q, [threat.pair])[0] < config.margin + _ARM_MARGIN:
                 return " / ".join(threat.names)

@@ -76,6 +76,18 @@ def test_a_tighter_limit_holds_too_and_takes_longer(model, with_limits, seed, na
     assert_within_limits(slower, motion)
 
 
+@pytest.mark.parametrize("binding", NAMES)
+def test_a_winding_path_is_run_slowly_enough_for_its_bends(model, with_limits, binding):
+    # All but one of the limits are out of reach.
+    wide = {name: np.full(6, 1e6) for name in NAMES if name != binding}
+    winding = with_limits(**wide)
+    u = np.linspace(0, 1, 120)[:, None]
+    path = SplinePath.through(model.spec.home + 0.05 * np.sin(2 * np.pi * u * np.arange(7, 13)))
+    motion = timed(winding, path, 0.5, T_at)
+    assert motion.duration > 0.5
+    assert_within_limits(winding, motion, 20_000)
+
+
 @PROPERTY
 @given(seed=seeds)
 def test_a_motion_is_slowed_down_no_more_than_needed(model, seed):

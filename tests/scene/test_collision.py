@@ -765,6 +765,22 @@ def test_all_that_is_carried_is_nearer_by_its_play_and_nothing_else_is(rods, see
         assert loose.too_close(q, max(margin - 2e-4, 0.0)) is None or expected.min() < 0
 
 
+def test_rough_distances_take_the_play_into_account():
+    # A pole that points at the middle of a block: the sphere about it is hardly nearer.
+    collision = simple(
+        ("pole", Shape("box", (1e-3, 1e-3, 0.4))), ("block", Shape("box", (1, 1, 1)))
+    )
+    q = collision.robot.home
+    T = collision.kinematics.fk(q)
+    Ts = {"block": pose(T[:3, 3] - [0, 0, 0.2 + 0.05 + 0.5])}
+    for play in (0.0, 0.02):
+        placed = collision.placed(Ts, 0.0, {"pole": np.eye(4)}, grasp_play=play)
+        (k,) = by_names(placed)["pole", "block"]
+        assert placed.distances(q)[k] == pytest.approx(0.05 - play, abs=ACCURACY)
+        assert rough_distances(placed, q)[k] == pytest.approx(0.05 - play, abs=1e-4)
+        assert rough_distances(placed, q)[k] <= 0.05 - play + ACCURACY
+
+
 @pytest.mark.parametrize("play", [-1e-6, np.nan, np.inf])
 def test_a_play_that_is_negative_or_not_finite_is_refused(rods, play):
     with pytest.raises(InvalidInput, match="grasp_play: expected a finite number >= 0 m, got"):
