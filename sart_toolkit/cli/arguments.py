@@ -324,6 +324,21 @@ class BenchmarkRadii:
 
 
 @dataclass(frozen=True)
+class BenchmarkCloud:
+    """How radii from the recorded pictures compare with those from the true scene.
+
+    Example: sart benchmark cloud --tasks all --out cloud.json
+    """
+
+    tasks: _TASKS = "all"
+    backends: _BACKENDS = "pybullet"
+    seed: _SEED = 0
+    out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_cloud.json")
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
 class BenchmarkSkill:
     """How well a skill learned from one demonstration does, on each task and backend.
 
@@ -387,6 +402,7 @@ Verb = (
         | Annotated[BenchmarkReplay, tyro.conf.subcommand("replay")]
         | Annotated[BenchmarkSegments, tyro.conf.subcommand("segments")]
         | Annotated[BenchmarkRadii, tyro.conf.subcommand("radii")]
+        | Annotated[BenchmarkCloud, tyro.conf.subcommand("cloud")]
         | Annotated[BenchmarkSkill, tyro.conf.subcommand("skill")],
         tyro.conf.subcommand(
             "benchmark",

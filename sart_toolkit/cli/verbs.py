@@ -24,6 +24,7 @@ from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.cli.arguments import (
     Augment,
+    BenchmarkCloud,
     BenchmarkOperator,
     BenchmarkRadii,
     BenchmarkReplay,
@@ -45,6 +46,7 @@ from sart_toolkit.evaluate.benchmark import (
     benchmark_operator,
     benchmark_replay,
 )
+from sart_toolkit.evaluate.clouds import benchmark_clouds
 from sart_toolkit.evaluate.motions import (
     RadiiConfig,
     SegmentsConfig,
@@ -486,6 +488,20 @@ def benchmark_radii_verb(args: BenchmarkRadii) -> Result:
     }
 
 
+def benchmark_cloud_verb(args: BenchmarkCloud) -> Result:
+    """`sart benchmark cloud`."""
+    cells = _cells(args.tasks, args.backends)
+    check_writable(args.out, args.overwrite)
+    with progress_bar("cloud", len(cells), "task") as bar:
+        result = benchmark_clouds(cells, args.seed, lambda done, _: bar.update(done - bar.n))
+    write_json(args.out, _about() | result)
+    return {"benchmark": str(args.out)} | {
+        name: f"{row['median_share']:.0%} of the exact radii at the median, at most "
+        f"{row['largest_excess_mm']:+.1f} mm larger"
+        for name, row in [*result["cells"].items(), ("all", result["total"])]
+    }
+
+
 def _about() -> Result:
     """What a benchmark's figures depend on, besides what is in its own config."""
     return {"command": shlex.join(["sart", *sys.argv[1:]]), "machine": doctor.machine()}
@@ -618,6 +634,7 @@ _VERBS: dict[type, Callable[[Any], Result]] = {
     BenchmarkOperator: benchmark_operator_verb,
     BenchmarkReplay: benchmark_replay_verb,
     BenchmarkSegments: benchmark_segments_verb,
+    BenchmarkCloud: benchmark_cloud_verb,
     BenchmarkRadii: benchmark_radii_verb,
     BenchmarkSkill: benchmark_skill_verb,
     Info: info_verb,

@@ -1,0 +1,42 @@
+"""The comparison of radii from pictures and from the scene counts what it finds."""
+
+import functools
+
+import pytest
+
+from sart_toolkit.backends import make_backend
+from sart_toolkit.evaluate.benchmark import Cell
+from sart_toolkit.evaluate.clouds import benchmark_clouds
+from sart_toolkit.robots import get_robot
+from sart_toolkit.tasks import get_task
+
+
+@pytest.fixture(scope="module")
+def compared():
+    task = get_task("peg_in_hole")
+    make = functools.partial(make_backend, "pybullet", get_robot(task.robot), task.scene, 96)
+    seen = []
+    found = benchmark_clouds(
+        [Cell(task, "pybullet", make)], progress=lambda done, wanted: seen.append((done, wanted))
+    )
+    assert seen == [(1, 1)]
+    return found
+
+
+def test_radii_of_both_sources_stand_side_by_side(compared):
+    row = compared["cells"]["peg_in_hole/pybullet"]
+    assert compared["total"]["n_spheres"] == len(row["spheres"]) == row["n_spheres_exact"] >= 2
+    shares = sorted(sphere["cloud"] / sphere["exact"] for sphere in row["spheres"])
+    assert shares[0] <= row["median_share"] <= shares[-1]
+    assert row["largest_excess_mm"] == pytest.approx(
+        max(1e3 * (sphere["cloud"] - sphere["exact"]) for sphere in row["spheres"])
+    )
+    assert row["spheres"][0]["cloud_limited_by"] == "peg / cloud"
+    assert row["seconds_exact"] > 0 and row["seconds_cloud"] > 0
+
+
+def test_the_cloud_s_points_lie_on_true_surfaces(compared):
+    errors = compared["cells"]["peg_in_hole/pybullet"]["surface_errors"]
+    assert errors["points"] > 1000
+    assert errors["median_mm"] <= errors["p95_mm"] <= errors["max_mm"]
+    assert errors["median_mm"] < 3 and errors["p95_mm"] < 8
