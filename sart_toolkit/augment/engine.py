@@ -70,12 +70,12 @@ class _Worker:
             config,
         )
 
-    def __call__(self, at: tuple[int, int]) -> tuple[int, int, str]:
+    def __call__(self, at: tuple[int, int]) -> tuple[int, int, str, str]:
         sphere, k = at
         attempt = self._try(sphere, k)
         if attempt.episode is not None:
             save_episode(self._directory / "episodes" / episode_name(sphere, k), attempt.episode)
-        return sphere, k, attempt.outcome
+        return sphere, k, attempt.outcome, attempt.detail
 
     def close(self) -> None:
         self._backend.close()
@@ -137,16 +137,18 @@ def augment_demonstration(
     quotas = [
         len(range(i, config.n - 1, len(annotation.spheres))) for i in range(len(annotation.spheres))
     ]
+    last = ""
     with worker_map(functools.partial(_Worker, make_backend, out, config), workers) as run:
         while batch := _next_batch(outcomes, quotas):
-            for sphere, k, outcome in run(batch):
+            for sphere, k, outcome, detail in run(batch):
                 outcomes[sphere, k] = outcome
                 row = {"sphere": sphere, "k": k, "outcome": outcome}
-                append_json_line(out / _LOG, row)
+                append_json_line(out / _LOG, row | ({"detail": detail} if detail else {}))
+                last = detail or last
                 if progress is not None:
                     kept = sum(o == KEPT for o in outcomes.values())
                     progress(kept, config.n - 1, len(outcomes) - kept)
-    return _finish(out, outcomes, request, time.perf_counter() - started)
+    return _finish(out, outcomes, request, time.perf_counter() - started, last)
 
 
 def _prepare(
@@ -217,14 +219,18 @@ def _check_capable(make_backend: BackendFactory, camera: str | None) -> None:
 
 
 def _finish(
-    out: Path, outcomes: dict[tuple[int, int], str], request: dict[str, Any], seconds: float
+    out: Path,
+    outcomes: dict[tuple[int, int], str],
+    request: dict[str, Any],
+    seconds: float,
+    last: str,
 ) -> Dataset:
     kept = sorted((k, s) for (s, k), outcome in outcomes.items() if outcome == KEPT)
     reasons = collections.Counter(o for o in outcomes.values() if o != KEPT)
     if not kept:
         raise InvalidInput(
             f"none of {len(outcomes)} tries was kept ({_counted(reasons)}); use smaller radii or "
-            "other waypoints"
+            "other waypoints" + (f"; the last: {last}" if last else "")
         )
     wanted = request["config"]["n"] - 1
     if len(kept) < wanted:

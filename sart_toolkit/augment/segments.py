@@ -41,10 +41,14 @@ _PATH_SAMPLES = 1000
 
 @dataclass(frozen=True)
 class Attempt:
-    """The outcome of one try: the episode, or the reason why it was rejected."""
+    """The outcome of one try: the episode, or the reason why it was rejected.
+
+    `outcome` is the same for all tries that fail alike; `detail` tells this one's figures.
+    """
 
     outcome: str
     episode: Episode | None
+    detail: str = ""
 
 
 class SegmentPlanner:
@@ -146,11 +150,11 @@ class SegmentMaker:
             motion, certificate = self._planner.plan(proposal, rng)
             recorder, joint_path = self._execute(motion, t_star)
             proof = self._proof(motion, certificate, joint_path, t_star)
-        except Unreachable:
-            return Attempt("out of reach", None)
+        except Unreachable as error:
+            return Attempt("out of reach", None, str(error))
         except MotionRejected as error:
             # What stands behind the colon differs each time.
-            return Attempt(str(error).partition(":")[0], None)
+            return Attempt(str(error).partition(":")[0], None, str(error))
         provenance = Provenance(
             demonstration_hash=self._annotation.demonstration_hash,
             sphere=sphere,

@@ -54,6 +54,8 @@ with _without_greetings():
     from pybullet_utils.bullet_client import BulletClient
 
 _STEPS = PHYSICS_HZ // CONTROL_HZ
+# As a prism, which is what a cylinder becomes otherwise, it would be a millimetre larger.
+_URDF_FLAGS = p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_IMPLICIT_CYLINDER
 # OpenGL's camera looks along -z with y up; ours looks along z with y down.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -117,9 +119,7 @@ class PyBulletBackend(Backend):
         c = self._client
         moving = {b.name: b for b in self.scene.bodies if b.joint and b.joint.parent == root.name}
         with _urdf_file(root, moving.values()) as path:
-            index = c.loadURDF(
-                path, useFixedBase=root.mass is None, flags=p.URDF_USE_INERTIA_FROM_FILE
-            )
+            index = c.loadURDF(path, useFixedBase=root.mass is None, flags=_URDF_FLAGS)
         self._bodies[root.name] = index, -1
         # PyBullet's base is a body's centre of mass with its principal axes.
         dynamics = c.getDynamicsInfo(index, -1)
@@ -148,7 +148,7 @@ class PyBulletBackend(Backend):
         self._robot = c.loadURDF(
             str(self._model.urdf),
             useFixedBase=True,
-            flags=p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_SELF_COLLISION,
+            flags=_URDF_FLAGS | p.URDF_USE_SELF_COLLISION,
         )
         joints, self._links = {}, {c.getBodyInfo(self._robot)[0].decode(): -1}
         parents = {-1: -1}
@@ -358,6 +358,8 @@ class PyBulletBackend(Backend):
         head, world = unpack_state(
             self.name, state, self.robot.name, self._scene_digest, sorted(self._bodies)
         )
+        # Contacts that are there already would keep forces that the file doesn't have.
+        self._forget_contacts()
         handle, path = tempfile.mkstemp(suffix=".bullet")
         try:
             with os.fdopen(handle, "wb") as file:

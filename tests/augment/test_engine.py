@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import re
 import shutil
 import subprocess
 import sys
@@ -27,7 +28,12 @@ from sart_toolkit.errors import (
     UnknownName,
 )
 from sart_toolkit.poses import interpolate, log_rotation, pose
-from sart_toolkit.records import apply_action, convergence_waypoint
+from sart_toolkit.records import (
+    Annotation,
+    PrecisionSphere,
+    apply_action,
+    convergence_waypoint,
+)
 from sart_toolkit.storage import load_dataset
 
 CROWDED = AugmentConfig(n=5, seed=3, duration=0.8)
@@ -256,6 +262,22 @@ def test_a_line_too_fast_for_the_joints_takes_longer_and_the_episode_says_so(
         assert len(episode) == round(10 * duration)
 
 
+def test_a_start_in_collision_is_told_with_the_pair_and_by_how_much(
+    peg_demonstration, peg_task, peg_backend, augment, annotate, tmp_path
+):
+    """The block stands where the peg is when the segment starts."""
+    sunk = np.array(peg_demonstration.body_Ts_world["block"])
+    sunk[:, 2, 3] += 0.2
+    shown = dataclasses.replace(
+        peg_demonstration, body_Ts_world={**peg_demonstration.body_Ts_world, "block": sunk}
+    )
+    Ts = shown.steps.measured_Ts_world_tool
+    annotation = Annotation((PrecisionSphere(20, Ts[20], 0.01),), shown.content_hash())
+    attempt = SegmentMaker(peg_backend, shown, annotation, AugmentConfig())(0, 0)
+    assert attempt.outcome.startswith("start too close")
+    assert re.search(r"start too close .* / block: they overlap by \d+\.\d mm", attempt.detail)
+
+
 def test_what_touches_in_spite_of_the_proof_ends_the_segment_at_once(
     peg_demonstration, peg_annotation, peg_backend, monkeypatch
 ):
@@ -265,7 +287,7 @@ def test_what_touches_in_spite_of_the_proof_ends_the_segment_at_once(
     bump = [Contact("block", "peg", 1.0, 0.0)]
     monkeypatch.setattr(peg_backend, "contacts", lambda: bump if len(steps) == 7 else [])
     make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
-    assert make(0, 0) == Attempt("contact block / peg", None)
+    assert make(0, 0) == Attempt("contact block / peg", None, "contact block / peg: stopped there")
     assert len(steps) == 7
 
 
