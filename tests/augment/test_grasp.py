@@ -125,6 +125,19 @@ def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(
     assert lifted > 0.01
 
 
+def test_a_try_with_an_object_in_the_grasp_does_not_depend_on_those_before(
+    backend, shown, annotation
+):
+    """Contacts that are there when a state is restored must leave nothing behind."""
+    make = SegmentMaker(backend, shown, annotation, AugmentConfig(n=8))
+    i = len(annotation.spheres) - 1
+    first = make(i, 0)
+    make(i, 1)
+    again = make(i, 0)
+    assert again.outcome == first.outcome == KEPT
+    assert again.episode.content_hash() == first.episode.content_hash()
+
+
 def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
     backend, model, shown, carried_at
 ):
