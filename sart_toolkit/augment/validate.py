@@ -35,7 +35,7 @@ from sart_toolkit.storage import (
     load_episode,
 )
 
-# Distances are good to coal's tolerance, and stored in whole micrometres.
+# Clearances are stored in hundredths of a millimetre, rounded down, deviations in micrometres.
 _LENGTH_TOLERANCE = 5e-6
 _JOINT_TOLERANCE = 1e-6
 _POSE_TOLERANCE = 1e-6

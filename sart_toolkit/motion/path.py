@@ -25,6 +25,8 @@ class SplinePath:
     def __init__(self, spline: BSpline) -> None:
         if spline.k != _DEGREE or spline.t[_DEGREE] != 0.0 or spline.t[-_DEGREE - 1] != 1.0:
             raise InvalidInput("spline: expected a quintic one over [0, 1]")
+        if (np.diff(spline.t[_DEGREE:-_DEGREE]) <= 0).any():
+            raise InvalidInput("spline: has a knot twice, so that it isn't smooth; remove one")
         self.spline = spline
         derivatives = _derivative_coefficients(spline.t, spline.c, 3)
         self.most = frozen([np.abs(c).max(0) for c in derivatives])

@@ -110,17 +110,19 @@ def timed(
         raise MotionRejected(f"joint limits: the path leaves the range of {joint}; sample nearer")
     law = _law(path, model.spec, duration)
     if law is None:
-        slow, fast = _LONGEST, duration
-        if _law(path, model.spec, slow) is None:
+        # In recorded steps: the fewest that are enough, and some that aren't.
+        enough, few = round(_LONGEST * RECORD_HZ), int(duration * RECORD_HZ)
+        if few >= enough or _law(path, model.spec, _LONGEST) is None:
             raise MotionRejected(
                 f"joint limits: the path needs more than {_LONGEST:.0f} s; sample nearer"
             )
-        while slow - fast > 0.5 / RECORD_HZ:
-            middle = 0.5 * (slow + fast)
-            slow, fast = (
-                (slow, middle) if _law(path, model.spec, middle) is None else (middle, fast)
-            )
-        duration = float(np.ceil(slow * RECORD_HZ - 1e-9)) / RECORD_HZ
+        while enough - few > 1:
+            middle = (enough + few) // 2
+            if _law(path, model.spec, middle / RECORD_HZ) is None:
+                few = middle
+            else:
+                enough = middle
+        duration = enough / RECORD_HZ
         law = _law(path, model.spec, duration)
         assert law is not None
     return Motion(path, duration, T_at, law)

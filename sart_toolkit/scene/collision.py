@@ -20,6 +20,8 @@ from sart_toolkit.scene.spec import SceneSpec
 Index = NDArray[np.intp]
 # Links of joints nearer to each other than this meet in the joints between them.
 _JOINTS_APART = 2
+# coal's own 1e-6 is relative to the distance, and lets normals be off by a milliradian.
+_TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -90,14 +92,28 @@ class CollisionModel:
         """Read the collision geometry of robot and scene.
 
         Raises:
-            InvalidInput: a body has no shape that collides, or a part of the robot is neither a
-                mesh nor a box, sphere or cylinder.
+            InvalidInput: a body has no shape that collides or is called as a frame of the robot, a
+                joint of the robot doesn't turn about its frame's z axis, or a part of the robot is
+                neither a mesh nor a box, sphere or cylinder.
         """
         self.robot = robot
         self.scene = scene
         self.kinematics = RobotModel(robot, scene.held)
         self._parts = robot_parts(self.kinematics)
+        model = self.kinematics.pinocchio_model
+        frames = {frame.name for frame in model.frames}
+        for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+            # What bounds motions takes a joint's axis to be its frame's z.
+            if joint.shortname() != "JointModelRZ":
+                raise InvalidInput(
+                    f"{robot.name}: joint {name!r} doesn't turn about its own z axis; give its "
+                    'URDF the axis "0 0 1"'
+                )
         for body in scene.bodies:
+            if body.name in frames:
+                raise InvalidInput(
+                    f"body {body.name!r}: the robot has a frame of that name; rename the body"
+                )
             if not any(shape.collides for shape in body.shapes):
                 raise InvalidInput(
                     f"body {body.name!r}: no shape of it collides, so nothing can be proved about "
@@ -109,12 +125,10 @@ class CollisionModel:
             for shape in body.shapes
             if shape.collides
         ]
-        n = len(robot.arm_joints)
         home = _link_poses(self.kinematics)
         self._T_joint_tool = home[robot.tool_frame]
         self._links = {part.body: inverse(home[part.body]) for part in self._parts}
-        self._moved_by_gripper = {part.body for part in self._parts if part.joint == n}
-        self._self_pairs: list[tuple[int, int]] | None = None
+        self._self_pairs = self._free_at_home(self._robot_parts(0.0))
 
     @functools.lru_cache(maxsize=32)  # noqa: B019 - models live as long as their process
     def _robot_parts(self, gripper: float) -> list[ConvexPart]:
@@ -163,7 +177,7 @@ class CollisionModel:
             if name not in known:
                 raise unknown_name("body or link", name, sorted(known))
         last = len(self.robot.arm_joints)
-        parts = list(self._robot_parts(round(float(gripper), 3)))
+        parts = list(self._robot_parts(round(float(gripper), 4)))
         n_robot = len(parts)
         for name, T_body_shape, geometry, corners in self._shapes:
             if name in carried:
@@ -174,8 +188,6 @@ class CollisionModel:
                 raise unknown_name("body", name, Ts_world_body)
             points = corners @ T[:3, :3].T + T[:3, 3]
             parts.append(ConvexPart(name, joint, geometry, T @ T_body_shape, points))
-        if self._self_pairs is None:
-            self._self_pairs = self._free_at_home(parts[:n_robot])
         pairs = list(self._self_pairs)
         standing = [i for i in range(n_robot, len(parts)) if parts[i].joint == 0]
         moving = [i for i in range(len(parts)) if parts[i].joint > 0]
@@ -253,7 +265,8 @@ class PlacedModel:
         for i, j in pairs:
             self._geometry.addCollisionPair(pin.CollisionPair(i, j))
         self._placements = self._geometry.createData()
-        self._at: Array | None = None
+        for request in self._placements.distanceRequests:
+            request.gjk_tolerance = _TOLERANCE
 
     def names(self, pair: int) -> tuple[str, str]:
         """The names of the two bodies of a pair, by its index."""
@@ -321,8 +334,12 @@ class PlacedModel:
         return np.where(between, moved, 0.0)
 
     def too_close(self, q: Array, margin: float) -> tuple[str, str] | None:
-        """The nearest pair at `q (n,)` if it is nearer than the margin [m]."""
-        bounds = self.bounds
+        """The nearest pair at `q (n,)` if it is nearer than the margin [m].
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+        """
+        q, bounds = self.kinematics.check_q(q), self.bounds
         centres, axes, middles = (each[0] for each in bounds.placed(self.joint_poses(q)[None]))
         a, b = bounds.first, bounds.second
         every = np.arange(len(self.pairs))
@@ -446,8 +463,9 @@ class Bounds:
             axes, middles: of the boxes of their second, `(..., k, 3, 3)`, `(..., k, 3)`.
             pair: `(k,)` pairs by index.
         """
-        local = np.matmul(axes, (centres - middles)[..., None])[..., 0]
-        return norms(np.maximum(np.abs(local) - self.half[pair], 0.0)) - self.radii[pair]
+        local = np.einsum("...ij,...j->...i", axes, centres - middles)
+        out = np.maximum(np.abs(local) - self.half.take(pair, 0), 0.0)
+        return np.asarray(norms(out) - self.radii.take(pair))
 
 
 def norms(vectors: Array) -> Array:

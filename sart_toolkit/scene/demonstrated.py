@@ -83,6 +83,11 @@ class DemonstratedScene:
             Mismatch: the demonstration doesn't tell where the scene's bodies were.
             InvalidInput: a body of the scene has no shape that collides.
         """
+        if demonstration.robot != robot.name:
+            raise Mismatch(
+                f"the demonstration is of robot {demonstration.robot!r}, not {robot.name!r}; give "
+                "its own"
+            )
         missing = [b.name for b in scene.bodies if b.name not in demonstration.body_Ts_world]
         if missing:
             raise Mismatch(

@@ -826,6 +826,36 @@ def test_some_pairs_are_as_far_as_among_all(cluttered, seed, kind):
     )
 
 
+@pytest.mark.parametrize("overlapping", [False, True])
+@pytest.mark.parametrize("kind", ["boxes", "shelf", "mixed"])
+def test_gradients_are_those_of_the_distances(cluttered, kind, overlapping, rng):
+    placed, h = cluttered[kind], 1e-3
+    errors = []
+    for _ in range(30):
+        q = joints_near(placed, rng)
+        distances = placed.distances(q)
+        choice = (distances < -1e-3) if overlapping else (distances > 1e-3) & (distances < 0.3)
+        pairs = np.flatnonzero(choice)
+        pairs = rng.permutation(pairs)[:8]
+        steps = h * np.eye(6)
+        ahead, behind = (
+            np.array([placed.distances(q + side * dq)[pairs] for dq in steps]) for side in (1, -1)
+        )
+        for k, expected in zip(pairs, ((ahead - behind) / (2 * h)).T, strict=True):
+            errors.append(np.abs(placed.gradient(q, int(k)) - expected).max())
+    assert len(errors) > 50
+    # But for where another corner or face becomes the nearest, or the nearest way out.
+    assert np.quantile(errors, 0.85) < 0.02
+
+
+def test_a_pair_that_just_touches_has_no_gradient(rods):
+    q = rods.robot.home
+    T = rods.kinematics.fk(q)
+    placed = rods.placed({"wire": T @ pose([0, 0.005, 0])}, 0.0, {"rod": np.eye(4)})
+    (k,) = by_names(placed)["rod", "wire"]
+    assert np.isfinite(placed.gradient(q, k)).all()
+
+
 @pytest.fixture(scope="module")
 def box_and_ball():
     return simple(("box", Shape("box", (0.2, 0.1, 0.4))), ("far", Shape("sphere", (0.1,))))
