@@ -39,6 +39,7 @@ from sart_toolkit.learn.training import (
 from sart_toolkit.learn.windows import Batch, build_windows
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.motion.line import straight_line
+from sart_toolkit.motion.path import SplinePath
 from sart_toolkit.poses import Array, apply_motion, check_positive, inverse, pose
 from sart_toolkit.records import (
     CONTROL_HZ,
@@ -64,7 +65,7 @@ from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
 from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.testing.closest import ClosestPoints
-from sart_toolkit.testing.clutter import CLUTTER, random_segment
+from sart_toolkit.testing.clutter import CLUTTER, Segment, random_segment
 
 _DEMONSTRATION_STEPS = 60
 _SEGMENT_STEPS = 20
@@ -334,8 +335,7 @@ def bench_certificate(arguments: Sequence[str]) -> dict[str, Any]:
         for batch in range(batches):
             rng = np.random.default_rng([options.seed, i, batch])
             setting = _setting(kind, rng)
-            for _ in range(min(50, wanted - 50 * batch)):
-                rows.append(_certified_row(setting, options, rng))
+            rows += _certified_rows(setting, min(50, wanted - 50 * batch), options, rng)
             setting.closest.close()
             _say(f"{kind}: {min(50 * (batch + 1), wanted)}/{wanted}")
     return {
@@ -386,11 +386,49 @@ def _setting(kind: str, rng: np.random.Generator) -> _Setting:
     return _Setting(kind, placed, closest, model, SceneSpec(standing), home)
 
 
-def _certified_row(
-    setting: _Setting, options: argparse.Namespace, rng: np.random.Generator
-) -> dict[str, Any]:
-    """One random segment's certificate, its time, and what the independent check says."""
+def _certified_rows(
+    setting: _Setting, count: int, options: argparse.Namespace, rng: np.random.Generator
+) -> list[dict[str, Any]]:
+    """Random segments' certificates, their times, and what the independent check says.
+
+    All are drawn first, then all certified: nothing else runs between two certificates.
+    """
     margin = options.margin
+    drawn = [_segment_path(setting, rng) for _ in range(count)]
+    many, few = (np.linspace(0, 1, n) for n in (options.samples, _NAIVE_POINTS))
+    # What is computed once for a scene in its place belongs to none of its segments.
+    certify(setting.placed, drawn[0][1], margin)
+    certified = [_timed(certify, setting.placed, path, margin) for _, path in drawn]
+    naive = [
+        _timed(_naively_clear, setting.placed, path.positions(few), margin) for _, path in drawn
+    ]
+    rows = []
+    for (segment, path), (certificate, seconds), (naive_clear, naive_seconds) in zip(
+        drawn, certified, naive, strict=True
+    ):
+        _, nearest = setting.closest.nearest_along(path.positions(many), within=0.05)
+        rows.append(
+            {
+                "scene": setting.name,
+                "beside": bool(segment.beside),
+                "verdict": certificate.verdict,
+                "seconds": seconds,
+                "checks": certificate.checks,
+                "clearance": certificate.clearance,
+                "true_clearance": nearest.distance,
+                "true_pair": [nearest.a, nearest.b],
+                "unsound": certificate.verdict == "free" and nearest.distance < 0,
+                "naive_clear": naive_clear,
+                "naive_seconds": naive_seconds,
+                "q_start": segment.q_start.tolist(),
+                "T_world_end": segment.T_world_end.tolist(),
+            }
+        )
+    return rows
+
+
+def _segment_path(setting: _Setting, rng: np.random.Generator) -> tuple[Segment, SplinePath]:
+    """A random segment that starts clear, and its joint path."""
     while True:
         segment = random_segment(
             setting.model,
@@ -399,37 +437,22 @@ def _certified_row(
             setting.scene,
             accept_start=lambda q: not setting.closest.collides(q),
         )
+        ends = segment.T_world_start, segment.T_world_end
         try:
-            path = straight_line(
-                setting.model, segment.q_start, segment.T_world_start, segment.T_world_end, 2.0
-            ).path
-            break
+            return segment, straight_line(setting.model, segment.q_start, *ends, 2.0).path
         except (Unreachable, MotionRejected):
             continue
+
+
+def _naively_clear(placed: PlacedModel, configurations: Array, margin: float) -> bool:
+    return all(placed.distances(q).min() >= margin for q in configurations)
+
+
+def _timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+    """What a function returns, and its seconds."""
     started = time.perf_counter()
-    certificate = certify(setting.placed, path, margin)
-    seconds = time.perf_counter() - started
-    started = time.perf_counter()
-    few = path.positions(np.linspace(0, 1, _NAIVE_POINTS))
-    naive_clear = all(setting.placed.distances(q).min() >= margin for q in few)
-    naive_seconds = time.perf_counter() - started
-    many = path.positions(np.linspace(0, 1, options.samples))
-    _, nearest = setting.closest.nearest_along(many, within=0.05)
-    return {
-        "scene": setting.name,
-        "beside": bool(segment.beside),
-        "verdict": certificate.verdict,
-        "seconds": seconds,
-        "checks": certificate.checks,
-        "clearance": certificate.clearance,
-        "true_clearance": nearest.distance,
-        "true_pair": [nearest.a, nearest.b],
-        "unsound": certificate.verdict == "free" and nearest.distance < 0,
-        "naive_clear": naive_clear,
-        "naive_seconds": naive_seconds,
-        "q_start": segment.q_start.tolist(),
-        "T_world_end": segment.T_world_end.tolist(),
-    }
+    result = function(*arguments)
+    return result, time.perf_counter() - started
 
 
 def _certificate_figures(rows: Sequence[dict[str, Any]], margin: float) -> dict[str, Any]:

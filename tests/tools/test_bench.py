@@ -44,6 +44,16 @@ def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
     assert "turn 1/1" in err
 
 
+def test_the_certificate_benchmark_counts_verdicts_and_what_they_miss(capsys):
+    assert bench.main(["certificate", "--segments", "20", "--samples", "60", "--seed", "3"]) == 0
+    figures = json.loads(capsys.readouterr().out.splitlines()[-1])["figures"]
+    assert figures["segments"] == 20 and len(figures["scenes"]) == 10
+    assert figures["free"] + figures["collision"] + figures["undecided"] == 20
+    assert figures["free"] > 0 and figures["collision"] > 0
+    assert figures["unsound"] == figures["falsely_rejected"] == 0 and figures["surprises"] == []
+    assert 0 < figures["milliseconds"]["median"] <= figures["milliseconds"]["p99"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
