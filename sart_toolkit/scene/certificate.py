@@ -77,7 +77,8 @@ class Certificate:
 
         The last digits of a distance hang on what was computed before.
         """
-        clearance = float(np.floor(self.clearance * 1e5) / 1e5)
+        # What is rounded already stays as it is.
+        clearance = float(np.floor(self.clearance * 1e5 + 1e-7) / 1e5)
         return asdict(self) | {"pair": list(self.pair), "clearance": clearance}
 
     @staticmethod
