@@ -136,6 +136,8 @@ class Augment:
 
     Example: sart augment demo.h5 annotation.json --out dataset --n 100 --law area --workers 2
 
+    Example: sart augment demo.h5 annotation.json --out dataset --strategy sart_planned
+
     An interrupted generation goes on where it was when the same command is typed again.
     """
 
@@ -146,7 +148,10 @@ class Augment:
     out: Annotated[Path, arg(help="Directory to write.")]
     n: _N = 40
     backend: Annotated[str | None, arg(help="Backend; the demonstration's if left out.")] = None
-    strategy: Annotated[str, arg(help="How segments are chosen.")] = "sart"
+    strategy: Annotated[
+        str,
+        arg(help="sart: straight lines; sart_planned: round obstacles where these are blocked."),
+    ] = "sart"
     law: _LAW = "paper"
     rotation_per_metre: Annotated[
         float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")
