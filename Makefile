@@ -17,7 +17,7 @@ help: ## list the targets
 
 setup: $(VENV)/.setup ## install the toolkit, simulators, planner and what the tests need into .venv
 
-setup-all: $(VENV)/.setup-all ## add the annotation window with its Debian libraries
+setup-all: $(VENV)/.setup-all ## add the windows for teaching and annotating, with their Debian libraries
 
 demo: setup ## learn peg-in-hole from one demonstration and write a report
 	$(BIN)/sart run peg_in_hole --out $(DEMO_OUT)
@@ -25,7 +25,7 @@ demo: setup ## learn peg-in-hole from one demonstration and write a report
 
 # One thread a test process: two processes already fill two cores, and torch's threads would
 # wait for each other.
-test: setup ## run the tests (PYTEST_ARGS="-k name" for some of them)
+test: setup-all ## run the tests (PYTEST_ARGS="-k name" for some of them)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
 
 lint: setup ## check style and types
@@ -51,5 +51,5 @@ $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
 
 $(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh
 	bash tools/setup_debian.sh annotate
-	$(PIP_INSTALL) -e '.[dev,sapien,planning,annotate]'
+	$(PIP_INSTALL) -e '.[dev,sapien,planning,teleop,annotate]'
 	@touch $@
