@@ -176,30 +176,32 @@ class _Search:
         self._best, self._best_pair = np.inf, -1
 
     def run(self) -> Certificate:
-        count = len(self._placed.pairs)
-        lo: Index = np.repeat(np.arange(_FIRST_KNOTS - 1), count)
-        hi = lo + 1
-        pair: Index = np.tile(np.arange(count), _FIRST_KNOTS - 1)
+        count, first = len(self._placed.pairs), _FIRST_KNOTS - 1
+        ends: Index = np.stack([np.arange(first), np.arange(first) + 1])
+        # What is still open: pairs, and the columns of `ends` that are their intervals' knots.
+        interval: Index = np.repeat(np.arange(first), count)
+        pair: Index = np.tile(np.arange(count), first)
         while len(pair):
-            mu, rough = self._motion(lo, hi, pair)
+            mu, rough = self._motion(ends, interval, pair)
             # Rough bounds only settle what is far, so that the clearance proved says something.
             # Written so that what is no number stays open.
             open_ = ~(rough >= max(self._margin, _FAR))
             self._note(np.where(open_, np.inf, rough), pair)
-            lo, hi, pair, mu = lo[open_], hi[open_], pair[open_], mu[open_]
+            interval, pair, mu = interval[open_], pair[open_], mu[open_]
             if not len(pair):
                 break
+            knots = ends.take(interval, 1)
             if self._checks + 2 * len(pair) > self._max_checks:
-                return self._certificate("undecided", self._knots.s[lo[0]], int(pair[0]))
-            d_lo, d_hi = self._exact(lo, pair), self._exact(hi, pair)
-            if min(d_lo.min(), d_hi.min()) < self._margin:
+                return self._certificate("undecided", self._knots.s[knots[0, 0]], int(pair[0]))
+            distances = self._exact(knots, pair)
+            if distances.min() < self._margin:
                 return self._first_hit()
-            bound = (d_lo + d_hi - mu) / 2 - _ACCURACY
+            bound = (distances.sum(0) - mu) / 2 - _ACCURACY
             open_ = ~(bound >= self._margin)
             self._note(np.where(open_, np.inf, bound), pair)
-            lo, hi, pair = lo[open_], hi[open_], pair[open_]
+            interval, pair = interval[open_], pair[open_]
             if len(pair):
-                lo, hi, pair = self._bisect(lo, hi, pair)
+                ends, interval, pair = self._bisect(ends, interval, pair)
         return self._certificate("free", 0.0, self._best_pair)
 
     def _note(self, bound: Array, pair: Index) -> None:
@@ -208,47 +210,51 @@ class _Search:
         if bound[least] < self._best:
             self._best, self._best_pair = float(bound[least]), int(pair[least])
 
-    def _twists(self, chord: Array, knots: Index) -> tuple[Array, Array]:
+    def _twists(self, chord: Array, ends: Index) -> tuple[Array, Array]:
         """The joints' angular velocities and velocities at the origin, `(2, k, n + 1, 3)` each.
 
-        They are those along chords `(k, n)`, per unit of a chord's parameter, at knots `(2, k)`.
+        They are those along chords `(k, n)`, per unit of a chord's parameter, at its ends `(2, k)`.
         """
-        shape = *knots.shape, 1 + chord.shape[1], 3
+        shape = *ends.shape, 1 + chord.shape[1], 3
         spin, drift = np.zeros(shape), np.zeros(shape)
         chord = chord[:, :, None]
-        np.cumsum(self._knots.turns[knots] * chord, 2, out=spin[:, :, 1:])
-        np.cumsum(self._knots.moments[knots] * chord, 2, out=drift[:, :, 1:])
+        np.cumsum(self._knots.turns[ends] * chord, 2, out=spin[:, :, 1:])
+        np.cumsum(self._knots.moments[ends] * chord, 2, out=drift[:, :, 1:])
         return spin, drift
 
-    def _motion(self, lo: Index, hi: Index, pair: Index) -> tuple[Array, Array]:
-        """For pairs on intervals: mu `(k,)` [m], and what spheres and boxes prove `(k,)` [m]."""
+    def _motion(self, ends: Index, interval: Index, pair: Index) -> tuple[Array, Array]:
+        """For pairs on intervals: mu `(k,)` [m], and what spheres and boxes prove `(k,)` [m].
+
+        `ends (2, m)` are the intervals' knots; each pair has one of them by `interval (k,)`.
+        """
         bounds, at = self._placed.bounds, self._knots
-        starts, ends, interval = _intervals(lo, hi)
-        chord = at.q[ends] - at.q[starts]
-        spin, drift = self._twists(chord, np.stack([starts, ends]))
+        chord = at.q[ends[1]] - at.q[ends[0]]
+        spin, drift = self._twists(chord, ends)
         # Rows of arrays laid flat are taken several times as fast as by several indices.
+        base = bounds.joint_b.take(pair)
         joint_a, joint_b = (
-            interval * spin.shape[2] + joint.take(pair)
-            for joint in (bounds.joint_a, bounds.joint_b)
+            interval * spin.shape[2] + joint for joint in (bounds.joint_a.take(pair), base)
         )
         turn, drifted = (
             each.take(joint_a, 1) - each.take(joint_b, 1)
             for each in (spin.reshape(2, -1, 3), drift.reshape(2, -1, 3))
         )
-        of = np.stack([lo, hi]) * at.centres.shape[1]
+        of = ends.take(interval, 1) * at.centres.shape[1]
         first, second = of + bounds.first.take(pair), of + bounds.second.take(pair)
         centres = at.centres.reshape(-1, 3).take(first, 0)
         move = _cross(turn, centres) + drifted
         mu = 0.5 * (norms(move) + norms(turn) * bounds.radii.take(pair)).sum(0)
-        bulge = self._path.bulge(at.s[starts], at.s[ends])
-        mu += _excess(chord.take(interval, 0), bulge.take(interval, 0), bounds.reach.take(pair, 0))
+        bulge = self._path.bulge(at.s[ends[0]], at.s[ends[1]])
+        excess = _excess(chord, bulge)
+        chain = excess.reshape(-1, chord.shape[1]).take(interval * excess.shape[1] + base, 0)
+        mu += np.einsum("ij,ij->i", bounds.reach.take(pair, 0), chain)
         axes = at.axes.reshape(-1, 9).take(second, 0).reshape(*second.shape, 3, 3)
         middles = at.middles.reshape(-1, 3).take(second, 0)
         apart = bounds.rough_distances(centres, axes, middles, pair)
         return mu, (apart.sum(0) - mu) / 2
 
     def _exact(self, knots: Index, pair: Index) -> Array:
-        """Distances [m] of pairs at knots, each computed once."""
+        """Distances `(2, k)` [m] of pairs `(k,)` at knots `(2, k)`, each computed once."""
         known = self._knots.distances
         asked = np.zeros(known.shape, bool)
         asked[knots, pair] = True
@@ -259,12 +265,18 @@ class _Search:
             self._checks += len(pairs)
         return np.asarray(known[knots, pair])
 
-    def _bisect(self, lo: Index, hi: Index, pair: Index) -> tuple[Index, Index, Index]:
-        starts, ends, interval = _intervals(lo, hi)
-        middles = (self._knots.s[starts] + self._knots.s[ends]) / 2
-        mid = len(self._knots.s) + interval
-        self._knots = self._knots.and_then(_Knots.at(self._placed, self._path, middles))
-        return np.concatenate([lo, mid]), np.concatenate([mid, hi]), np.concatenate([pair, pair])
+    def _bisect(self, ends: Index, interval: Index, pair: Index) -> tuple[Index, Index, Index]:
+        """The halves of the intervals that are still open, and what is open in them."""
+        kept = np.flatnonzero(np.bincount(interval, minlength=ends.shape[1]))
+        ends = ends[:, kept]
+        interval = np.searchsorted(kept, interval)
+        middles: Index = len(self._knots.s) + np.arange(len(kept))
+        at = self._knots.s[ends].sum(0) / 2
+        self._knots = self._knots.and_then(_Knots.at(self._placed, self._path, at))
+        halves = np.concatenate(
+            [np.stack([ends[0], middles]), np.stack([middles, ends[1]])], axis=1
+        )
+        return halves, np.concatenate([interval, interval + len(kept)]), np.tile(pair, 2)
 
     def _first_hit(self) -> Certificate:
         """The collision found nearest to the path's start."""
@@ -287,22 +299,17 @@ class _Search:
         return Certificate(verdict, float(clearance), self._margin, names, float(at), self._checks)
 
 
-def _intervals(lo: Index, hi: Index) -> tuple[Index, Index, Index]:
-    """The different intervals: their first and last knots, and which one each is."""
-    count = int(hi.max()) + 1
-    keys, interval = np.unique(lo * count + hi, return_inverse=True)
-    return keys // count, keys % count, interval
+def _excess(chord: Array, bulge: Array) -> Array:
+    """What curvature adds to mu, as factors of R_j: `(k, n + 1, n)` for chords, bulges `(k, n)`.
 
-
-def _excess(chord: Array, bulge: Array, reach: Array) -> Array:
-    """What curvature adds to mu [m]: A / 4 + 2 sum_j R_j e_j, over the last axis of each.
-
-    A = sum_m R_m (S_m^2 - S_(m-1)^2), S_m being the sum of |dq_j| up to joint m of the chain.
+    mu grows by sum_j R_j (S_j^2 - S_(j-1)^2) / 4 + 2 R_j e_j, the first of which is A / 4, S_j
+    being the sum of |dq_m| of the joints m of the chain up to j. Row b is for a chain from joint b.
     """
-    sums = np.cumsum(np.where(reach > 0, np.abs(chord), 0.0), -1)
-    squares = sums**2
-    squares[..., 1:] -= squares[..., :-1].copy()
-    return np.asarray((reach * (0.25 * squares + 2 * bulge)).sum(-1))
+    k, n = chord.shape
+    sums = np.zeros((k, n + 1))
+    np.cumsum(np.abs(chord), 1, out=sums[:, 1:])
+    squares = np.maximum(sums[:, None, :] - sums[:, :, None], 0.0) ** 2
+    return np.asarray(0.25 * np.diff(squares) + 2 * bulge[:, None])
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -108,8 +108,7 @@ def motion_bounds(placed, path, s_lo, s_hi, pairs):
     """mu, and what spheres and boxes prove, of pairs on one interval."""
     search = _Search(placed, path, 0.0, 1)
     search._knots = _Knots.at(placed, path, np.array([s_lo, s_hi]))
-    first = np.zeros(len(pairs), np.intp)
-    return search._motion(first, first + 1, np.asarray(pairs))
+    return search._motion(np.array([[0], [1]]), np.zeros(len(pairs), np.intp), np.asarray(pairs))
 
 
 @settings(PROPERTY, max_examples=60)
