@@ -16,6 +16,7 @@ from sart_toolkit.errors import InvalidInput
 
 Array = NDArray[np.float64]
 _ORTHONORMAL_TOLERANCE = 1e-6
+_IDENTITY, _LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def check_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
@@ -69,9 +70,9 @@ def check_poses(name: str, value: ArrayLike) -> Array:
         # A rotation's entries are at most 1; larger ones might overflow in the product.
         (np.abs(rotations) > 1 + _ORTHONORMAL_TOLERANCE).any()
         or (
-            np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)) > _ORTHONORMAL_TOLERANCE
+            np.abs(rotations @ rotations.transpose(0, 2, 1) - _IDENTITY) > _ORTHONORMAL_TOLERANCE
         ).any()
-        or (np.abs(poses[:, 3] - np.array([0, 0, 0, 1])) > 1e-12).any()
+        or (np.abs(poses[:, 3] - _LAST_ROW) > 1e-12).any()
         or (np.linalg.det(rotations) < 0).any()
     ):
         raise InvalidInput(

@@ -22,6 +22,7 @@ Index = NDArray[np.intp]
 _JOINTS_APART = 2
 # coal's own 1e-6 is relative to the distance, and lets normals be off by a milliradian.
 _TOLERANCE = 1e-8
+_YZX, _ZXY = [1, 2, 0], [2, 0, 1]
 
 
 @dataclass(frozen=True)
@@ -328,7 +329,7 @@ class PlacedModel:
         if found.distance + self.play[pair] < 0:
             length = -length
         poses = self.joint_poses(q)[1:]
-        moved = np.cross(poses[:, :3, 2], found.p_a - poses[:, :3, 3]) @ (normal / length)
+        moved = cross(poses[:, :3, 2], found.p_a - poses[:, :3, 3]) @ (normal / length)
         index = np.arange(len(q))
         between = (index >= self.parts[j].joint) & (index < self.parts[i].joint)
         return np.where(between, moved, 0.0)
@@ -466,6 +467,11 @@ class Bounds:
         local = np.einsum("...ij,...j->...i", axes, centres - middles)
         out = np.maximum(np.abs(local) - self.half.take(pair, 0), 0.0)
         return np.asarray(norms(out) - self.radii.take(pair))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """The cross products `(..., 3)`; NumPy's own takes five times as long."""
+    return np.asarray(a[..., _YZX] * b[..., _ZXY] - a[..., _ZXY] * b[..., _YZX])
 
 
 def norms(vectors: Array) -> Array:

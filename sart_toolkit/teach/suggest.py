@@ -296,6 +296,8 @@ def suggest_radius(
     best = surroundings.proved(t, config)
     if room is not None and room.radius < best.radius:
         best = dataclasses.replace(room, clearance=best.clearance)
+    if best.radius < config.min_radius:
+        return dataclasses.replace(best, radius=0.0)
     q_key = demonstration.steps.joint_positions[t]
     threats = _threats(surroundings.placed(t), q_key, _STEEPEST * best.radius + _ARM_MARGIN)
     while best.radius >= config.min_radius:
@@ -379,6 +381,16 @@ class _Threat:
     distance: float
     slope: Array
 
+    @functools.cached_property
+    def straight(self) -> float:
+        """The greatest slope by moving, metres a metre."""
+        return float(np.linalg.norm(self.slope[:3]))
+
+    @functools.cached_property
+    def turning(self) -> float:
+        """The greatest slope by turning [m/rad]."""
+        return float(np.linalg.norm(self.slope[3:]))
+
     @staticmethod
     def of(placed: PlacedModel, pair: int, distance: float, q: Array) -> _Threat:
         # The tool's motion is J dq.
@@ -408,32 +420,37 @@ def _directed(
 ) -> str | None:
     """The names of a pair that a draw aimed at it brings too close; None if there is none.
 
-    Tried are the draw that brings a pair nearest by its distance's gradient at the waypoint, and
-    the one that does so by the gradient found there.
+    Tried are the draw that brings a pair nearest by its distance's gradient at the waypoint, and,
+    where that came half the way, the one that does so by the gradient found there.
     """
     angle = config.rotation_per_metre * radius
-    for threat in threats:
-        q = q_key
-        for again in range(2):
-            if again:
-                threat = _Threat.of(placed, threat.pair, threat.distance, q)
-            straight, turning = (
-                float(np.linalg.norm(each)) for each in (threat.slope[:3], threat.slope[3:])
-            )
+
+    def approach(threat: _Threat) -> float:
+        """By how much [m] the pair comes nearer within the sphere, by its slope."""
+        return threat.straight * radius + threat.turning * angle
+
+    # The likeliest first: a radius that is too large is then soon found to be.
+    for threat in sorted(threats, key=lambda threat: threat.distance - approach(threat)):
+        aimed, q = threat, q_key
+        for _ in range(2):
             # Nowhere near, even if it all got twice as steep.
-            if threat.distance > 2 * (straight * radius + turning * angle) + _ARM_MARGIN:
+            if threat.distance > 2 * approach(aimed) + _ARM_MARGIN:
                 break
             R = placed.kinematics.fk(q)[:3, :3]
             found = reached(
-                -R @ threat.slope[:3] / max(straight, 1e-12),
-                -threat.slope[3:] / max(turning, 1e-12),
+                -R @ aimed.slope[:3] / max(aimed.straight, 1e-12),
+                -aimed.slope[3:] / max(aimed.turning, 1e-12),
             )
             if isinstance(found, str):
                 # What can't be reached can't collide.
                 break
             q = found
-            if placed.pair_distances(q, [threat.pair])[0] < config.margin + _ARM_MARGIN:
+            distance = placed.pair_distances(q, [threat.pair])[0]
+            if distance < config.margin + _ARM_MARGIN:
                 return " / ".join(threat.names)
+            if distance > threat.distance / 2:
+                break
+            aimed = _Threat.of(placed, threat.pair, threat.distance, q)
     return None
 
 
