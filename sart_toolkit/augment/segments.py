@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.strategies import Proposal, get_strategy
@@ -14,7 +13,7 @@ from sart_toolkit.backends.interface import Backend, Observation
 from sart_toolkit.errors import MotionRejected, Unreachable
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.motion.line import straight_line
-from sart_toolkit.motion.path import PolylinePath
+from sart_toolkit.motion.path import PolylinePath, nearest_on_polyline
 from sart_toolkit.motion.planning import plan_motion
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array, inverse
@@ -275,9 +274,9 @@ def path_deviation(placed: PlacedModel, motion: Motion, joint_path: Array) -> fl
     """
     # In these units of length all joints count alike.
     reach = placed.bounds.reach.max(0, initial=0.0)
-    on_path = motion.path.positions(np.linspace(0.0, 1.0, _PATH_SAMPLES))
-    _, nearest = cKDTree(on_path * reach).query(joint_path * reach)
-    return float((np.abs(joint_path - on_path[nearest]) @ reach).max())
+    on_path = motion.path.positions(np.linspace(0.0, 1.0, _PATH_SAMPLES)) * reach
+    measured = joint_path * reach
+    return float(np.abs(measured - nearest_on_polyline(measured, on_path)).sum(1).max())
 
 
 def _micrometres_up(length: float) -> float:

@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.segments import KEPT, SegmentMaker, SegmentPlanner
@@ -22,6 +21,7 @@ from sart_toolkit.backends.interface import Backend
 from sart_toolkit.errors import InvalidInput, Mismatch, MotionRejected, Unreachable
 from sart_toolkit.evaluate.benchmark import Cell
 from sart_toolkit.evaluate.statistics import wilson_interval
+from sart_toolkit.motion.path import nearest_on_polyline
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array, exp_rotation, inverse
 from sart_toolkit.records import (
@@ -132,27 +132,13 @@ def check_motion(model: RobotModel, motion: Motion, q_start: Array) -> LimitChec
 def tool_off_path(model: RobotModel, motion: Motion, configurations: Array) -> float:
     """How far [m] the tool is at most from a motion's path, at configurations `(k, n)`."""
     on_path = motion.joints(np.concatenate([[0.0], motion.times(PHYSICS_HZ)]))
-    line = _tool_points(model, on_path)
-    return float(_distances_to_polyline(_tool_points(model, configurations), line).max())
+    points = _tool_points(model, configurations)
+    off = points - nearest_on_polyline(points, _tool_points(model, on_path))
+    return float(np.linalg.norm(off, axis=1).max())
 
 
 def _tool_points(model: RobotModel, configurations: Array) -> Array:
     return np.array([model.fk(q)[:3, 3] for q in configurations])
-
-
-def _distances_to_polyline(points: Array, line: Array) -> Array:
-    """Distances `(k,)` of points `(k, 3)` from a line through many points `(m, 3)`.
-
-    Only the two pieces at the nearest of these points are looked at.
-    """
-    _, nearest = cKDTree(line).query(points)
-    distances = np.full(len(points), np.inf)
-    for first in (np.maximum(nearest - 1, 0), np.minimum(nearest, len(line) - 2)):
-        a, b = line[first], line[first + 1]
-        along = ((points - a) * (b - a)).sum(1) / np.maximum(((b - a) ** 2).sum(1), 1e-300)
-        foot = a + np.clip(along, 0.0, 1.0)[:, None] * (b - a)
-        distances = np.minimum(distances, np.linalg.norm(points - foot, axis=1))
-    return distances
 
 
 class _Segments:
@@ -444,7 +430,7 @@ class SphereTrial:
         came nearer than the margin, and the play in the grasp, that a suggested radius leaves.
         """
         t = sphere.waypoint
-        self._place(t)
+        self._checker.place(*self._scene.at(t))
         return {
             "waypoint": t,
             "radius": sphere.radius,
@@ -453,14 +439,6 @@ class SphereTrial:
             **self._random(sphere, rng),
             "grown": self._directed(sphere, rng),
         }
-
-    def _place(self, t: int) -> None:
-        demonstration = self._scene.demonstration
-        steps = demonstration.steps
-        Ts = {name: poses[t] for name, poses in demonstration.body_Ts_world.items()}
-        T_tool_world = inverse(steps.measured_Ts_world_tool[t])
-        carried = {name: T_tool_world @ Ts[name] for name in self._scene.phases[t].carried}
-        self._checker.place(Ts, float(np.clip(steps.measured_gripper[t], 0.0, 1.0)), carried)
 
     def _joints(self, t: int, T_world_tool: Array) -> Array | None:
         """Joints `(n,)` near waypoint `t`'s for a tool pose; None where there are none."""

@@ -6,6 +6,7 @@ import functools
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
+from scipy.spatial import cKDTree
 
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, check_array, frozen
@@ -89,6 +90,23 @@ class PolylinePath:
                 nearest = ends[0][k] + np.clip(along, 0.0, 1.0)[:, None] * chord
                 bulges[k] = np.abs(inside - nearest).max(0)
         return bulges
+
+
+def nearest_on_polyline(points: Array, line: Array) -> Array:
+    """The points `(k, d)` of a line through many points `(m, d)` that are nearest to `(k, d)`.
+
+    Only the two pieces at the nearest of the line's points are looked at.
+    """
+    _, nearest = cKDTree(line).query(points)
+    found, least = np.empty_like(points), np.full(len(points), np.inf)
+    for first in (np.maximum(nearest - 1, 0), np.minimum(nearest, len(line) - 2)):
+        a, b = line[first], line[first + 1]
+        along = ((points - a) * (b - a)).sum(1) / np.maximum(((b - a) ** 2).sum(1), 1e-300)
+        foot = a + np.clip(along, 0.0, 1.0)[:, None] * (b - a)
+        distances = np.linalg.norm(points - foot, axis=1)
+        found[distances < least] = foot[distances < least]
+        least = np.minimum(least, distances)
+    return found
 
 
 @functools.cache

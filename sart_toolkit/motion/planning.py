@@ -25,7 +25,7 @@ from sart_toolkit.poses import Array, check_pose, check_positive, distance, inte
 from sart_toolkit.records import RECORD_HZ
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scene.certificate import Certificate, certify
-from sart_toolkit.scene.collision import PlacedModel
+from sart_toolkit.scene.collision import PlacedModel, gap_text
 
 _DEGREE = 5
 # Control points of the smooth path. The fewest make the smoothest; the most follow its corners.
@@ -247,10 +247,7 @@ def _too_close(
     """The error that names the nearest pair at `q` and its distance."""
     nearest = placed.nearest(q)
     assert nearest is not None
-    if nearest.distance < 0:
-        apart = f"they overlap by {-nearest.distance * 1e3:.1f} mm"
-    else:
-        apart = f"{nearest.distance * 1e3:.1f} mm apart, {margin * 1e3:.1f} mm are asked for"
+    apart = gap_text(nearest.distance, margin)
     return MotionRejected(f"{what} too close {nearest.a} / {nearest.b}: {apart}; {remedy}")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sart_toolkit.errors import InvalidInput, MotionRejected
 from sart_toolkit.poses import Array, check_positive
-from sart_toolkit.scene.collision import Index, PlacedModel, cross, norms
+from sart_toolkit.scene.collision import Index, PlacedModel, cross, gap_text, norms
 
 _FIRST_KNOTS = 3
 _FAR = 0.005
@@ -56,10 +56,7 @@ class Certificate:
             MotionRejected: it isn't; the message names the pair, where, and by how much.
         """
         pair = " / ".join(self.pair)
-        if self.clearance < 0:
-            apart = f"they overlap by {-self.clearance * 1e3:.1f} mm"
-        else:
-            apart = f"{self.clearance * 1e3:.1f} mm apart, {self.margin * 1e3:.1f} mm are asked for"
+        apart = gap_text(self.clearance, self.margin)
         if self.verdict == "collision" and self.at == 0.0:
             raise MotionRejected(f"start too close {pair}: {apart}; start elsewhere")
         if self.verdict == "collision":

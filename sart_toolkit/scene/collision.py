@@ -555,6 +555,13 @@ def primitive(geometry: coal.CollisionGeometry) -> Shape:
     )
 
 
+def gap_text(distance: float, margin: float) -> str:
+    """How two bodies at a distance [m] that is less than the margin [m] stand, for a message."""
+    if distance < 0:
+        return f"they overlap by {-distance * 1e3:.1f} mm"
+    return f"{distance * 1e3:.1f} mm apart, {margin * 1e3:.1f} mm are asked for"
+
+
 def coal_geometry(shape: Shape) -> coal.CollisionGeometry:
     """A shape as coal takes it, at its own origin."""
     if shape.kind == "box":
