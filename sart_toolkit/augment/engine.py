@@ -134,9 +134,7 @@ def augment_demonstration(
     if finished is not None:
         return finished
     outcomes = _read_attempts(out)
-    quotas = [
-        len(range(i, config.n - 1, len(annotation.spheres))) for i in range(len(annotation.spheres))
-    ]
+    quotas = config.quotas([sphere.radius for sphere in annotation.spheres])
     last = ""
     with worker_map(functools.partial(_Worker, make_backend, out, config), workers) as run:
         while batch := _next_batch(outcomes, quotas):

@@ -152,6 +152,10 @@ class Augment:
         str,
         arg(help="sart: straight lines; sart_planned: round obstacles where these are blocked."),
     ] = "sart"
+    share: Annotated[
+        Literal["radius", "equal"],
+        arg(help="How spheres share the trajectories: by their radii, or equally as in the paper."),
+    ] = "radius"
     law: _LAW = "paper"
     rotation_per_metre: Annotated[
         float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")

@@ -191,6 +191,7 @@ def augment_verb(args: Augment) -> Result:
     annotation = load_annotation(args.annotation)
     config = AugmentConfig(
         n=args.n,
+        share=args.share,
         strategy=args.strategy,
         sampling=SamplingConfig(args.law, args.rotation_per_metre),
         duration=args.duration,

@@ -1,0 +1,44 @@
+"""How the spheres of an annotation share the trajectories."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.errors import UnknownName
+
+radii = st.lists(st.floats(0.004, 0.2), min_size=1, max_size=8)
+numbers = st.integers(2, 200)
+
+
+def test_an_unknown_share_is_refused():
+    with pytest.raises(UnknownName, match="share 'radios'.*radius"):
+        AugmentConfig(share="radios")
+
+
+@given(radii=radii, n=numbers)
+def test_equal_shares_go_round_robin(radii, n):
+    expected = [len(range(i, n - 1, len(radii))) for i in range(len(radii))]
+    assert AugmentConfig(n, share="equal").quotas(radii) == expected
+
+
+@given(radii=radii, n=numbers)
+def test_shares_follow_the_radii(radii, n):
+    quotas = AugmentConfig(n).quotas(radii)
+    assert sum(quotas) == n - 1
+    # Nobody could hand a trajectory on to a sphere that has fewer for its radius.
+    for a, r_a in zip(quotas, radii, strict=True):
+        for b, r_b in zip(quotas, radii, strict=True):
+            assert a == 0 or r_a / (2 * a - 1) >= r_b / (2 * b + 1) * (1 - 1e-12)
+
+
+@given(radii=radii, n=numbers)
+def test_more_trajectories_take_none_away(radii, n):
+    fewer, more = (AugmentConfig(m).quotas(radii) for m in (n, n + 1))
+    assert all(a <= b for a, b in zip(fewer, more, strict=True))
+
+
+def test_a_wide_sphere_gets_most():
+    assert AugmentConfig(40).quotas([0.122, 0.005, 0.004, 0.0075]) == [35, 1, 1, 2]
