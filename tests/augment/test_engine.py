@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sart_toolkit.augment import engine
-from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.config import SHARES, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.segments import KEPT, Attempt, SegmentMaker, SegmentPlanner
 from sart_toolkit.augment.strategies import STRATEGIES
@@ -205,13 +205,13 @@ def test_a_try_depends_on_seed_sphere_and_number_alone(
 # --- what is kept, rejected and counted ---------------------------------------------------------
 
 
-def test_quotas_go_round_robin_over_the_spheres(peg_annotation, augment, tmp_path):
-    n = 4 + 2 * len(peg_annotation.spheres)
-    dataset = augment(peg_annotation, tmp_path / "d", AugmentConfig(n=n))
+@pytest.mark.parametrize("share", SHARES)
+def test_every_sphere_gets_its_quota(peg_annotation, augment, tmp_path, share):
+    config = AugmentConfig(n=10, share=share, camera=None)
+    dataset = augment(peg_annotation, tmp_path / "d", config)
     made = Counter(episode.provenance.sphere for episode in dataset.episodes)
-    quotas = [len(range(i, n - 1, len(peg_annotation.spheres))) for i in made]
-    assert [made[i] for i in made] == quotas
-    assert dataset.info["n_trajectories"] == n
+    spheres = peg_annotation.spheres
+    assert [made[i] for i in range(len(spheres))] == config.quotas([s.radius for s in spheres])
 
 
 def test_tries_that_would_touch_are_rejected_and_counted_by_what_touched(crowded_dataset):
@@ -233,7 +233,9 @@ def test_a_sphere_that_gives_nothing_leaves_fewer_trajectories_and_a_warning(
 ):
     with caplog.at_level(logging.WARNING):
         dataset = augment(
-            annotate((0, 0.01), (34, 1.5)), tmp_path / "d", AugmentConfig(n=3, duration=0.5)
+            annotate((0, 0.01), (34, 1.5)),
+            tmp_path / "d",
+            AugmentConfig(n=3, duration=0.5, share="equal"),
         )
     assert [episode.provenance.sphere for episode in dataset.episodes] == [0]
     assert "only 1 of 2 trajectories were kept (" in caplog.text
@@ -478,7 +480,7 @@ import sys
 import numpy as np
 from pathlib import Path
 from sart_toolkit.augment import engine
-from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.config import SHARES, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.segments import KEPT, Attempt, SegmentMaker, SegmentPlanner
 from sart_toolkit.backends import make_backend
