@@ -47,14 +47,10 @@ from sart_toolkit.evaluate.benchmark import (
     benchmark_replay,
 )
 from sart_toolkit.evaluate.clouds import benchmark_clouds
-from sart_toolkit.evaluate.motions import (
-    RadiiConfig,
-    SegmentsConfig,
-    benchmark_radii,
-    benchmark_segments,
-)
+from sart_toolkit.evaluate.radii import RadiiConfig, benchmark_radii
 from sart_toolkit.evaluate.report import write_report
 from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
+from sart_toolkit.evaluate.segments import SegmentsConfig, benchmark_segments
 from sart_toolkit.learn.skill import load_skill, save_skill
 from sart_toolkit.learn.training import TrainConfig, train
 from sart_toolkit.records import Dataset, Demonstration, library_versions

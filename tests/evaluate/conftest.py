@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 from sart_toolkit import storage
+from sart_toolkit.backends import make_backend
+from sart_toolkit.evaluate.benchmark import Cell
 from sart_toolkit.evaluate.video import caption, write_video
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.records import (
@@ -25,6 +28,8 @@ from sart_toolkit.records import (
     Provenance,
     Steps,
 )
+from sart_toolkit.robots import get_robot
+from sart_toolkit.tasks.task import Task
 
 KEYS = (0, 18, 30)
 RADII = (0.08, 0.045, 0.02)
@@ -254,3 +259,21 @@ def edit_json() -> Callable[[Path, dict[str, Any]], None]:
         path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
     return edit
+
+
+@pytest.fixture(scope="session")
+def make_cell() -> Callable[[Task], Cell]:
+    """A task on PyBullet, its pictures tiny."""
+
+    def make(task: Task) -> Cell:
+        robot = get_robot(task.robot)
+        return Cell(
+            task, "pybullet", functools.partial(make_backend, "pybullet", robot, task.scene, 16)
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def peg_cell(make_cell: Callable[[Task], Cell], peg_task: Task) -> Cell:
+    return make_cell(peg_task)

@@ -1,12 +1,10 @@
-"""Benchmarks of motions and radii: they count honestly, go on, and find faults that are planted."""
+"""The benchmark of segments counts honestly, goes on, and finds faults that are planted."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +13,12 @@ import pytest
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.segments import Attempt, SegmentPlanner
-from sart_toolkit.backends import make_backend
 from sart_toolkit.cli import main
 from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
-from sart_toolkit.evaluate import motions
+from sart_toolkit.evaluate import segments
 from sart_toolkit.evaluate.benchmark import Cell
-from sart_toolkit.evaluate.motions import (
-    RadiiConfig,
+from sart_toolkit.evaluate.segments import (
     SegmentsConfig,
-    SphereTrial,
-    benchmark_radii,
     benchmark_segments,
     check_motion,
     tool_off_path,
@@ -36,15 +30,12 @@ from sart_toolkit.records import Annotation, Demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.peg_in_hole import PegInHole
 from sart_toolkit.tasks.task import Stage, Task
-from sart_toolkit.testing.closest import ClosestPoints
 
 PEG = "peg_in_hole/pybullet"
 LID = "lid_closing/pybullet"
-FEW = RadiiConfig(draws=40, directed=400)
 
 
 class Interrupted(Exception):
@@ -59,17 +50,6 @@ class LazyPeg(PegInHole):
         return [Stage(T, state.gripper, 0.1)]
 
 
-def cell(task: Task) -> Cell:
-    robot = get_robot(task.robot)
-    make = functools.partial(make_backend, "pybullet", robot, task.scene, 16)
-    return Cell(task, "pybullet", make)
-
-
-@pytest.fixture(scope="module")
-def peg_cell(peg_task: Task) -> Cell:
-    return cell(peg_task)
-
-
 def counted(result: dict[str, Any]) -> Any:
     """The figures that depend neither on the machine's speed nor on coal's last digits."""
     rows = {
@@ -77,9 +57,6 @@ def counted(result: dict[str, Any]) -> Any:
         for name, row in result["cells"].items()
     }
     return json.loads(json.dumps(rows))
-
-
-# --- segments -----------------------------------------------------------------------------------
 
 
 def test_segments_are_tallied_by_sphere_and_their_motions_checked(
@@ -123,7 +100,7 @@ def test_contacts_and_paths_that_were_left_are_told_apart_from_other_rejections(
         def __call__(self, sphere: int, k: int) -> Attempt:
             return Attempt(next(self.left), None)
 
-    monkeypatch.setattr(motions, "SegmentMaker", Unlucky)
+    monkeypatch.setattr(segments, "SegmentMaker", Unlucky)
     result = benchmark_segments([peg_cell], SegmentsConfig(3), tmp_path / "out.json")
     for row in (result["total"], result["cells"][PEG]):
         assert row["rejections"] == dict.fromkeys(outcomes, 1)
@@ -174,9 +151,11 @@ def test_interrupted_segments_go_on_where_they_were(tmp_path: Path, peg_cell: Ce
         benchmark_segments([peg_cell], config, out)
 
 
-def test_tries_are_shared_by_the_cells(tmp_path: Path, peg_cell: Cell) -> None:
+def test_tries_are_shared_by_the_cells(
+    tmp_path: Path, peg_cell: Cell, make_cell: Callable[[Task], Cell]
+) -> None:
     result = benchmark_segments(
-        [peg_cell, cell(get_task("lid_closing"))], SegmentsConfig(3), tmp_path / "out.json"
+        [peg_cell, make_cell(get_task("lid_closing"))], SegmentsConfig(3), tmp_path / "out.json"
     )
     assert [result["cells"][name]["attempted"] for name in (PEG, LID)] == [2, 1]
     assert result["total"]["attempted"] == 3
@@ -184,9 +163,11 @@ def test_tries_are_shared_by_the_cells(tmp_path: Path, peg_cell: Cell) -> None:
         benchmark_segments([peg_cell, peg_cell], SegmentsConfig(1), tmp_path / "few.json")
 
 
-def test_a_demonstration_that_fails_is_refused(tmp_path: Path) -> None:
+def test_a_demonstration_that_fails_is_refused(
+    tmp_path: Path, make_cell: Callable[[Task], Cell]
+) -> None:
     with pytest.raises(Mismatch, match="did not reach the goal"):
-        benchmark_segments([cell(LazyPeg())], SegmentsConfig(1), tmp_path / "out.json")
+        benchmark_segments([make_cell(LazyPeg())], SegmentsConfig(1), tmp_path / "out.json")
 
 
 @pytest.fixture(scope="module")
@@ -230,97 +211,11 @@ def test_the_tool_s_distance_from_the_path_is_measured(
     assert tool_off_path(peg_model, motion, q[None]) == pytest.approx(0.003, abs=1e-5)
 
 
-# --- radii --------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def trial(peg_task: Task, peg_scene: DemonstratedScene) -> Iterator[SphereTrial]:
-    with closing(ClosestPoints(get_robot(peg_task.robot), peg_task.scene)) as checker:
-        yield SphereTrial(peg_scene, checker, FEW)
-
-
-def test_suggested_spheres_hold_no_collision_and_somewhat_larger_ones_do(
-    trial: SphereTrial, peg_annotation: Annotation
-) -> None:
-    for sphere in peg_annotation.spheres:
-        row = trial(sphere, np.random.default_rng(0))
-        assert (row["draws"], row["collisions"], row["unreachable"]) == (40, 0, 0)
-        # The two models agree wherever both look at the nearest pair.
-        assert 0.0 < row["least_mm"] <= row["least_checked_mm"] + 0.1
-        assert row["grown"]["radius"] == pytest.approx(1.15 * sphere.radius)
-        assert row["grown"]["collided"] and row["grown"]["within_margin"]
-        assert row["grown"]["least_mm"] < 0.0
-
-
-def test_a_sphere_three_times_too_large_is_found_out(
-    trial: SphereTrial, peg_annotation: Annotation
-) -> None:
-    for sphere in peg_annotation.spheres:
-        large = dataclasses.replace(sphere, radius=3 * sphere.radius)
-        row = trial(large, np.random.default_rng(0))
-        assert row["collisions"] > 0 > row["least_mm"]
-        assert row["least_checked_mm"] < 0.0
-        seen = row["first_collisions"][0]
-        assert min(seen["mm"], seen["checked_mm"]) < 0.0
-
-
-def test_a_sphere_with_room_left_shows_no_collision_when_grown(
-    trial: SphereTrial, peg_annotation: Annotation
-) -> None:
-    narrow = peg_annotation.spheres[-1]
-    small = dataclasses.replace(narrow, radius=0.3 * narrow.radius)
-    row = trial(small, np.random.default_rng(0))
-    assert not row["grown"]["collided"] and not row["grown"]["within_margin"]
-    assert (row["grown"]["draws"], row["collisions"]) == (FEW.directed, 0)
-
-
-def test_only_spheres_limited_by_two_bodies_are_grown(
-    trial: SphereTrial, peg_annotation: Annotation
-) -> None:
-    for reason in ("max_radius", "reach", "contact peg / block at waypoint 30", None):
-        other = dataclasses.replace(peg_annotation.spheres[0], limited_by=reason)
-        assert trial(other, np.random.default_rng(0))["grown"] is None
-
-
-def test_radii_are_counted_over_cells_and_go_on_where_they_were(
-    tmp_path: Path, peg_cell: Cell
-) -> None:
-    def stop(done: int, wanted: int) -> None:
-        raise Interrupted
-
-    cells, out = [peg_cell, cell(get_task("lid_closing"))], tmp_path / "out.json"
-    run: Callable[..., dict[str, Any]] = functools.partial(benchmark_radii, cells, ClosestPoints)
-    with pytest.raises(Interrupted):
-        run(FEW, out, progress=stop)
-    with pytest.raises(Mismatch, match="add --overwrite"):
-        run(RadiiConfig(draws=41, directed=400), out)
-    calls: list[tuple[int, int]] = []
-    result = run(FEW, out, progress=lambda *args: calls.append(args))
-    assert calls == [(2, 2)]
-    assert json.loads(out.read_text())["cells"] == json.loads(json.dumps(result["cells"]))
-    assert [path.name for path in tmp_path.iterdir()] == ["out.json"]
-    for row in result["cells"].values():
-        assert row["n_draws"] == 40 * len(row["spheres"])
-        assert 0.0 < row["seconds_suggest"] < 10.0
-        assert row["waypoints"] > 20
-    total = result["total"]
-    assert total["n_spheres"] == sum(len(row["spheres"]) for row in result["cells"].values())
-    assert (total["n_collisions"], total["collisions"]["rate"]) == (0, 0.0)
-    assert total["n_collided_when_grown"] == total["n_limited_by_pair"] > 3
-    assert total["collided_when_grown"]["ci95"][1] == 1.0
-
-
-# --- what is refused, and the command line ------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: SegmentsConfig(count=0), "count: expected at least 1"),
         (lambda: SegmentsConfig(seed=-1), "seed: expected a whole number"),
-        (lambda: RadiiConfig(draws=0), "draws: expected at least 1"),
-        (lambda: RadiiConfig(directed=0), "directed: expected at least 1"),
-        (lambda: RadiiConfig(growth=0.9), "growth: expected 1 to 10"),
     ],
 )
 def test_bad_numbers_are_refused(make: Callable[[], Any], message: str) -> None:
@@ -331,14 +226,10 @@ def test_bad_numbers_are_refused(make: Callable[[], Any], message: str) -> None:
 def test_the_command_line_prints_a_line_for_each_cell(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    out = tmp_path / "out.json"
     task = ["--tasks", "peg_in_hole", "--backends", "pybullet", "--workers", "1", "--json"]
-    for kind, flags, said in (
-        ("segments", ["--count", "2"], "2/2 kept"),
-        ("radii", ["--draws", "2", "--directed", "50"], "0 collisions in"),
-    ):
-        out = tmp_path / f"{kind}.json"
-        main(["benchmark", kind, *task, *flags, "--out", str(out)])
-        result = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-        assert set(result) == {"benchmark", PEG, "all"}
-        assert said in result[PEG]
-        assert {"command", "machine", "versions", "config"} <= set(json.loads(out.read_text()))
+    main(["benchmark", "segments", *task, "--count", "2", "--out", str(out)])
+    result = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert set(result) == {"benchmark", PEG, "all"}
+    assert "2/2 kept" in result[PEG]
+    assert {"command", "machine", "versions", "config"} <= set(json.loads(out.read_text()))
