@@ -70,9 +70,11 @@ class Run:
 
 @dataclass(frozen=True)
 class Record:
-    """Record one demonstration by the scripted operator.
+    """Record one demonstration: steered by you, in a window, or by the scripted operator.
 
     Example: sart record peg_in_hole --out demo.h5
+
+    Example: sart record peg_in_hole --out demo.h5 --device keyboard
 
     Example: sart record toolbox_picking --out demo.h5 --backend sapien
 
@@ -81,8 +83,23 @@ class Record:
 
     task: _TASK
     out: Annotated[Path, arg(help="HDF5 file to write.")]
+    device: Annotated[str, arg(help="What steers: keyboard, spacemouse, gamepad, or scripted.")] = (
+        "scripted"
+    )
     backend: _BACKEND = "pybullet"
     robot: _ROBOT = None
+    frame: Annotated[
+        Literal["world", "tool"] | None,
+        arg(help="What your directions are fixed to at first: world, or tool. F changes it."),
+    ] = None
+    operator: Annotated[
+        str | None, arg(help="Who steers, kept with the demonstration; 'person' if left out.")
+    ] = None
+    max_seconds: Annotated[float, arg(help="Longest demonstration [s].")] = 120.0
+    status: Annotated[
+        Path | None,
+        arg(help="File for other programs to watch: one JSON line for each recorded step."),
+    ] = None
     seed: _SEED = 0
     placement: Annotated[
         Literal["middle", "random"], arg(help="Where the object stands in its range.")

@@ -39,6 +39,7 @@ from sart_toolkit.cli.arguments import (
     Validate,
 )
 from sart_toolkit.cli.console import progress_bar, say, show
+from sart_toolkit.cli.teleop import check_hand_options, record_by_hand
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
 from sart_toolkit.evaluate.benchmark import (
     BenchmarkConfig,
@@ -79,8 +80,9 @@ from sart_toolkit.storage import (
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.teach.cloud import CloudSurroundings
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import record_demonstration
+from sart_toolkit.teach.devices import make_device
+from sart_toolkit.teach.devices.manual import ManualDevice
+from sart_toolkit.teach.session import DeviceSetup, SessionConfig, record_demonstration
 from sart_toolkit.teach.suggest import (
     ExactSurroundings,
     SuggestConfig,
@@ -134,15 +136,28 @@ def record_verb(args: Record) -> Result:
         raise InvalidInput("--yaw-deg: turns random placements only; add --placement random")
     with closing(make()) as backend:
         model = RobotModel(backend.robot, backend.scene.held)
-        device = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
-        with progress_bar("record", None, "s") as bar:
-            demonstration = record_demonstration(
-                backend, task, model, device, placement, args.seed,
-                progress=lambda seconds: bar.update(seconds - bar.n),
-            )  # fmt: skip
-    if not task.achieved(demonstration.success):
-        raise Mismatch("the demonstration did not reach the goal; record again with another --seed")
-    save_demonstration(args.out, demonstration)
+        state = task.initial_state(model, placement)
+        device = make_device(
+            args.device,
+            DeviceSetup(
+                backend, task, model, state, rng, args.frame or "world", args.operator or "person"
+            ),
+        )
+        check_hand_options(args, device.interactive)
+        if isinstance(device, ManualDevice):
+            demonstration = record_by_hand(args, backend, task, model, device, placement)
+        else:
+            config = SessionConfig(max_seconds=args.max_seconds)
+            with progress_bar("record", None, "s") as bar:
+                demonstration = record_demonstration(
+                    backend, task, model, device, placement, args.seed, config,
+                    progress=lambda seconds: bar.update(seconds - bar.n),
+                )  # fmt: skip
+            if not task.achieved(demonstration.success):
+                raise Mismatch(
+                    "the demonstration did not reach the goal; record again with another --seed"
+                )
+            save_demonstration(args.out, demonstration)
     return {"demonstration": str(args.out), **_describe_demonstration(demonstration)}
 
 
@@ -340,7 +355,8 @@ def run_whole(args: Run) -> Result:
     skill, evaluation = out / "skill", out / "evaluation.json"
     steps: list[tuple[str, Path, Callable[[], Result]]] = [
         ("record", demo, lambda: record_verb(Record(
-            args.task, demo, args.backend, args.robot, args.seed, image_size=args.image_size
+            args.task, demo, backend=args.backend, robot=args.robot, seed=args.seed,
+            image_size=args.image_size,
         ))),
         ("suggest", annotation, lambda: suggest_verb(Suggest(demo, annotation))),
         ("augment", dataset / "dataset.json", lambda: augment_verb(Augment(
@@ -582,6 +598,8 @@ def _describe_demonstration(demonstration: Demonstration) -> Result:
         "placement": dict(d.task_parameters.get("placement", {})),
         "cameras": {k: "x".join(map(str, c.rgb.shape[1:3])) for k, c in d.steps.cameras.items()},
         "operator": d.operator,
+        "device": d.device,
+        "seconds_spent": round(d.seconds, 1),
         "content_hash": d.content_hash(),
     }
 
