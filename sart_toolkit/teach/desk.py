@@ -11,6 +11,8 @@ from sart_toolkit.records import Demonstration
 from sart_toolkit.teach.devices.manual import Control, ManualDevice
 from sart_toolkit.teach.session import End, Phase, TeleopSession
 
+# More than this [N] is a hard press, which a person should be told of before all else.
+FIRM = 50.0
 # So much [s] may be thrown away without being asked again.
 _SOON_DONE_AGAIN = 3.0
 
@@ -79,12 +81,17 @@ class RecordingDesk:
                 return Notice("Saved.", "good")
         if session.trouble:
             return Notice(f"{session.trouble}: the tool stays here; steer back", "bad")
+        touch = ""
+        if session.contacts:
+            firmest = session.contacts[0]
+            touch = f"{firmest.a} / {firmest.b}, {firmest.force:.0f} N"
+            if firmest.force > FIRM:
+                return Notice(f"pressing hard: {touch}; ease off", "bad")
         if session.success:
             left = max(0.0, session.task.hold - session.success_held)
             return Notice(f"Goal reached. Keep it for another {left:.1f} s", "good")
-        if session.contacts:
-            firmest = session.contacts[0]
-            return Notice(f"contact: {firmest.a} / {firmest.b}, {firmest.force:.0f} N", "warning")
+        if touch:
+            return Notice(f"contact: {touch}", "warning")
         return Notice("Recording. → ends it, ← starts again.")
 
     def _ended_notice(self) -> Notice:
@@ -97,7 +104,7 @@ class RecordingDesk:
         text = f"Goal not reached: {why}."
         if session.end is End.TIME:
             text = f"{session.config.max_seconds:.0f} s are over. {text}"
-        return Notice(f"{text} ← records again, → saves it nevertheless.", "warning")
+        return Notice(f"{text} ← records again; → twice saves it nevertheless.", "warning")
 
     def tick(self) -> None:
         """One control period: the device is read and, while recording, the robot moves by 1/30 s.

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from sart_toolkit.records import CONTROL_HZ, Image
-from sart_toolkit.teach.desk import RecordingDesk, Tone
+from sart_toolkit.teach.desk import FIRM, RecordingDesk, Tone
 from sart_toolkit.teach.devices.manual import SPEEDS, Control
 from sart_toolkit.teach.screen import (
     BACKGROUND,
@@ -48,8 +48,6 @@ _SCENE = (16, 16, 768, 768)
 _SIZES = (256, 320, 384, 448, 512)
 _SLOW, _QUICK = 0.040, 0.018
 _SAVED_SHOWN = 2.0
-# The bar is full at this force [N].
-_FULL_FORCE = 50.0
 
 
 class Pace:
@@ -179,7 +177,7 @@ class RecordingWindow:
         screen.text(
             (800, 48),
             f"{session.task.report_body} {place.x * 100:+.1f}, {place.y * 100:+.1f} cm"
-            f" from the middle  ·  {self._target}",
+            f" from the middle  ·  {_shortened(self._target)}",
             13, FAINT,
         )  # fmt: skip
         colour = _PHASE_COLOURS[session.phase]
@@ -221,7 +219,7 @@ class RecordingWindow:
         notice = self._desk.notice
         self._screen.box((800, 432, 464, 88), CARD, edge=_TONES[notice.tone])
         self._screen.box((800, 432, 8, 88), _TONES[notice.tone], radius=4)
-        self._screen.paragraph((820, 440, 434, 76), notice.text, 16)
+        self._screen.paragraph((822, 442, 430, 72), notice.text, 17)
 
     def _force(self) -> None:
         screen, session = self._screen, self._desk.session
@@ -234,7 +232,9 @@ class RecordingWindow:
         firmest = session.contacts[0]
         screen.text((800, 532), f"contact  {firmest.a} / {firmest.b}", 14, ORANGE)
         screen.text((1264, 532), f"{firmest.force:.0f} N", 14, ORANGE, bold=True, align="right")
-        screen.bar((800, 556, 464, 8), firmest.force / _FULL_FORCE, ORANGE)
+        screen.bar(
+            (800, 556, 464, 8), firmest.force / FIRM, RED if firmest.force > FIRM else ORANGE
+        )
 
     def _keys(self) -> None:
         screen, desk = self._screen, self._desk
@@ -246,9 +246,9 @@ class RecordingWindow:
         meanings = _MEANINGS[desk.session.phase]
         for i, (keys, what) in enumerate(zip(["→", "←", "Esc"], meanings, strict=True)):
             if what:
-                self._row((1096, 608 + 24 * i), keys, what, 52)
+                self._row((1096, 608 + 24 * i), keys, what, 58)
         for i, (keys, what) in enumerate((("1 2 3", "speed"), ("F", "directions"))):
-            self._row((1096, 680 + 24 * i), keys, what, 52)
+            self._row((1096, 680 + 24 * i), keys, what, 58)
         self._row((1096, 728), "Space", "gripper", 52)
         share = self._pace.share
         words = "in real time" if share > 0.97 else f"at {share:.0%} of real time"
@@ -257,3 +257,7 @@ class RecordingWindow:
     def _row(self, at: tuple[int, int], keys: str, what: str, indent: int) -> None:
         self._screen.text(at, keys, 14, BRIGHT, bold=True)
         self._screen.text((at[0] + indent, at[1]), what, 14, TEXT)
+
+
+def _shortened(path: str, most: int = 34) -> str:
+    return path if len(path) <= most else "…" + path[-most:]

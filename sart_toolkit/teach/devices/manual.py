@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sart_toolkit.backends.interface import Backend, Observation
+from sart_toolkit.backends.interface import Observation
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.spec import SceneSpec
 from sart_toolkit.teach.session import Device, DeviceSetup, Frame, TeleopCommand
 
 # Time constant [s] with which the tool's velocity follows the hand: a tap is a small, soft move.
@@ -53,24 +54,24 @@ class Views:
     R_tool_hand: Array
 
 
-def views(backend: Backend, model: RobotModel) -> Views:
+def views(model: RobotModel, scene: SceneSpec) -> Views:
     """The hand's directions for a robot and its scene.
 
     Without a camera in the scene the person is taken to stand behind the robot.
 
     Args:
-        backend: has the cameras.
-        model: the robot's kinematics.
+        model: the robot's kinematics, with its wrist camera.
+        scene: has the camera of the scene view.
     """
     up = np.array([0.0, 0.0, 1.0])
     right = np.array([0.0, -1.0, 0.0])
-    fixed = [camera for camera in backend.scene.cameras if camera.frame == "world"]
+    fixed = [camera for camera in scene.cameras if camera.frame == "world"]
     if fixed:
         level = fixed[0].T_frame_camera[:3, 0] * [1.0, 1.0, 0.0]
         # A camera on its side has no level right; the robot's will do.
         if np.linalg.norm(level) > 0.1:
             right = level / np.linalg.norm(level)
-    camera, home = backend.robot.wrist_camera, model.spec.home
+    camera, home = model.spec.wrist_camera, model.spec.home
     T_tool_camera = inverse(model.fk(home)) @ model.fk(home, camera.frame) @ camera.T_frame_camera
     # Along an axis of the tool, though the camera be mounted a little askew.
     axis = int(np.argmax(np.abs(T_tool_camera[:2, 0])))
@@ -108,7 +109,7 @@ class ManualDevice(Device):
         self.operator = setup.operator
         self.speed = SPEEDS[1]
         self.frame: Frame = setup.frame
-        self._views = views(setup.backend, setup.model)
+        self._views = views(setup.model, setup.backend.scene)
         self._start_gripper = setup.state.commanded_gripper
         self._controls: list[Control] = []
         self.rest()
