@@ -112,6 +112,34 @@ class Record:
 
 
 @dataclass(frozen=True)
+class Play:
+    """Look at a demonstration or an episode again, in a window or as an MP4 film.
+
+    Example: sart play demo.h5
+
+    Example: sart play dataset/episodes/sphere00_k00000.h5 --out episode.mp4
+
+    Example: sart play demo.h5 --camera wrist --out wrist.mp4 --speed 0.5
+    """
+
+    file: Annotated[
+        Positional[Path], arg(metavar="FILE", help="Demonstration, or an episode in its dataset.")
+    ]
+    out: Annotated[Path | None, arg(help="MP4 file to write; shown in a window if left out.")] = (
+        None
+    )
+    camera: Annotated[
+        str, arg(help="A camera of the scene, drawn again; or a recorded one, such as wrist.")
+    ] = "overview"
+    speed: Annotated[float, arg(help="Times real time.")] = 1.0
+    backend: Annotated[
+        str | None, arg(help="What draws the scene; the recording's backend if left out.")
+    ] = None
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
 class Suggest:
     """Suggest precision spheres for a demonstration, as a file that you can edit.
 
@@ -414,6 +442,7 @@ class Doctor:
 Verb = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Record, tyro.conf.subcommand("record")]
+    | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Suggest, tyro.conf.subcommand("suggest")]
     | Annotated[Augment, tyro.conf.subcommand("augment")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]

@@ -32,6 +32,7 @@ from sart_toolkit.cli.arguments import (
     BenchmarkSkill,
     Evaluate,
     Info,
+    Play,
     Record,
     Run,
     Suggest,
@@ -39,6 +40,7 @@ from sart_toolkit.cli.arguments import (
     Validate,
 )
 from sart_toolkit.cli.console import progress_bar, say, show
+from sart_toolkit.cli.play import check_play_options, load_playback, play
 from sart_toolkit.cli.teleop import check_hand_options, record_by_hand
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
 from sart_toolkit.evaluate.benchmark import (
@@ -54,6 +56,7 @@ from sart_toolkit.evaluate.motions import (
     benchmark_radii,
     benchmark_segments,
 )
+from sart_toolkit.evaluate.player import SceneView
 from sart_toolkit.evaluate.report import write_report
 from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
 from sart_toolkit.learn.skill import load_skill, save_skill
@@ -71,7 +74,7 @@ from sart_toolkit.storage import (
     load_dataset,
     load_dataset_info,
     load_demonstration,
-    load_episode,
+    load_recording,
     read_json,
     save_annotation,
     save_demonstration,
@@ -159,6 +162,21 @@ def record_verb(args: Record) -> Result:
                 )
             save_demonstration(args.out, demonstration)
     return {"demonstration": str(args.out), **_describe_demonstration(demonstration)}
+
+
+def play_verb(args: Play) -> Result:
+    """`sart play`."""
+    check_play_options(args)
+    playback = load_playback(args.file)
+    shown = playback.demonstration
+    if args.camera in shown.steps.cameras:
+        playback.camera = args.camera
+        return play(args, playback, None)
+    make = _backend_factory(
+        args.backend or shown.backend, get_task(shown.task), shown.robot, _image_size(shown)
+    )
+    with closing(make()) as backend:
+        return play(args, playback, SceneView(playback, backend, args.camera))
 
 
 def suggest_verb(args: Suggest) -> Result:
@@ -577,13 +595,10 @@ def info_verb(args: Info) -> Result:
         if "success_rate" in value:
             return {"kind": "evaluation", **_without_rows(value)}
         raise BrokenFile(f"{path}: neither an annotation nor an evaluation; pass another file")
-    try:
-        return {"kind": "demonstration", **_describe_demonstration(load_demonstration(path))}
-    except BrokenFile as error:
-        if "holds 'episode'" not in str(error):
-            raise
-    episode = load_episode(path)
-    return {"kind": "episode", "steps": len(episode), **_plain(episode.provenance)}
+    recording = load_recording(path)
+    if isinstance(recording, Demonstration):
+        return {"kind": "demonstration", **_describe_demonstration(recording)}
+    return {"kind": "episode", "steps": len(recording), **_plain(recording.provenance)}
 
 
 def _describe_demonstration(demonstration: Demonstration) -> Result:
@@ -644,6 +659,7 @@ def _plain(record: Any) -> Result:
 _VERBS: dict[type, Callable[[Any], Result]] = {
     Run: run_whole,
     Record: record_verb,
+    Play: play_verb,
     Suggest: suggest_verb,
     Augment: augment_verb,
     Validate: validate_verb,
