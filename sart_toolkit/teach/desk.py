@@ -165,8 +165,9 @@ class RecordingDesk:
             try:
                 self.device.connect()
             except DeviceLost as error:
-                self._said = Notice(f"{error}. Then press →.".capitalize(), "bad")
+                self._said = Notice(f"Can't steer: {error}. Then press →.", "bad")
                 return
+        self.device.halt()
         self.session.start()
 
     def _pause(self, why: str) -> None:

@@ -140,8 +140,12 @@ class ManualDevice(Device):
     def rest(self) -> None:
         """The hand at rest and the gripper as at the start, for another try."""
         self.gripper = self._start_gripper
-        self._velocity = np.zeros(6)
+        self.halt()
         self.let_go()
+
+    def halt(self) -> None:
+        """Begin again from rest, though something is pressed."""
+        self._velocity = np.zeros(6)
 
     def let_go(self) -> None:
         """Forget what is pressed: the window no longer hears when keys are released."""

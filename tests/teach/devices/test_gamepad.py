@@ -1,0 +1,161 @@
+"""An emulated gamepad, in the place of SDL's."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from sart_toolkit.errors import DeviceLost, MissingExtra
+from sart_toolkit.teach.desk import RecordingDesk
+from sart_toolkit.teach.devices import gamepad as module
+from sart_toolkit.teach.devices.gamepad import Axis, Button, Gamepad
+from sart_toolkit.teach.devices.manual import SPEEDS, Control
+from sart_toolkit.teach.session import Phase
+
+
+class Pad:
+    def __init__(self):
+        self.plugged = True
+        self.axes = dict.fromkeys(Axis, 0)
+        self.down = set()
+
+    def attached(self):
+        return self.plugged
+
+    def get_axis(self, axis):
+        return self.axes[axis]
+
+    def get_button(self, button):
+        return button in self.down
+
+
+@pytest.fixture
+def pad(monkeypatch):
+    pad = Pad()
+
+    def open_pad():
+        if not pad.plugged:
+            raise DeviceLost("no gamepad found; plug it in")
+        return pad
+
+    monkeypatch.setattr(module, "open_pad", open_pad)
+    return pad
+
+
+@pytest.fixture
+def gamepad(pad, peg_setup):
+    device = Gamepad(peg_setup)
+    device.connect()
+    return device
+
+
+FULL = 32767
+
+
+@pytest.mark.parametrize(
+    ("axis", "value", "expected"),
+    [
+        (Axis.LEFT_X, FULL, [1, 0, 0, 0, 0, 0]),
+        (Axis.LEFT_Y, -FULL, [0, 1, 0, 0, 0, 0]),
+        (Axis.LEFT_Y, FULL, [0, -1, 0, 0, 0, 0]),
+        (Axis.RIGHT_TRIGGER, FULL, [0, 0, 1, 0, 0, 0]),
+        (Axis.LEFT_TRIGGER, FULL, [0, 0, -1, 0, 0, 0]),
+        (Axis.RIGHT_Y, -FULL, [0, 0, 0, 1, 0, 0]),
+        (Axis.RIGHT_X, FULL, [0, 0, 0, 0, 0, -1]),
+        (Axis.LEFT_X, -FULL - 1, [-1, 0, 0, 0, 0, 0]),
+        (Axis.LEFT_X, 3000, [0] * 6),
+        (Axis.RIGHT_X, -3900, [0] * 6),
+    ],
+)
+def test_sticks_and_triggers_push_and_turn(pad, gamepad, axis, value, expected):
+    pad.axes[axis] = value
+    np.testing.assert_allclose(gamepad.poll(), expected)
+
+
+@pytest.mark.parametrize(("button", "way"), [(Button.DPAD_LEFT, 1), (Button.DPAD_RIGHT, -1)])
+def test_the_d_pad_tips_sideways(pad, gamepad, button, way):
+    pad.down = {button}
+    np.testing.assert_array_equal(gamepad.poll(), [0, 0, 0, 0, way, 0])
+
+
+def test_deflection_rises_from_the_dead_zone_on(pad, gamepad):
+    values = []
+    for x in range(0, FULL + 1, FULL // 20):
+        pad.axes[Axis.LEFT_X] = x
+        values.append(gamepad.poll()[0])
+    assert values[0] == 0 and values[-1] > 0.99 and (np.diff(values) >= 0).all()
+    assert max(np.diff(values)) < 0.1
+
+
+def test_a_held_button_counts_once(pad, gamepad):
+    gripper = gamepad.gripper
+    pad.down = {Button.A, Button.Y, Button.RIGHT_SHOULDER}
+    for _ in range(5):
+        gamepad.poll()
+    assert gamepad.gripper != gripper and gamepad.frame == "tool"
+    assert gamepad.speed is SPEEDS[2]
+    pad.down = {Button.LEFT_SHOULDER}
+    gamepad.poll()
+    assert gamepad.speed is SPEEDS[1]
+
+
+def test_an_emulated_gamepad_drives_a_whole_recording_with_its_own_buttons(
+    pad, gamepad, make_session, tick_until, ended
+):
+    saved = []
+    session = make_session()
+    desk = RecordingDesk(session, gamepad, saved.append)
+
+    def push(button):
+        pad.down = {button}
+        desk.tick()
+        pad.down = set()
+        desk.tick()
+
+    push(Button.START)
+    assert session.phase is Phase.RECORDING
+    push(Button.BACK)
+    assert session.phase is Phase.READY
+    push(Button.START)
+    pad.axes[Axis.LEFT_TRIGGER] = FULL
+    tick_until(desk, lambda: session.success)
+    pad.axes[Axis.LEFT_TRIGGER] = 0
+    tick_until(desk, ended(desk))
+    push(Button.START)
+    assert saved[0].device == "gamepad" and saved[0].success[-10:].all()
+
+
+def test_unplugging_pauses_and_plugging_in_goes_on(pad, gamepad, make_session, tick_until, ended):
+    session = make_session()
+    desk = RecordingDesk(session, gamepad, lambda _: None)
+    desk.press(Control.NEXT)
+    pad.axes[Axis.LEFT_TRIGGER] = FULL
+    for _ in range(20):
+        desk.tick()
+    pad.plugged = False
+    desk.tick()
+    assert session.phase is Phase.PAUSED and session.seconds == pytest.approx(20 / 30)
+    assert "the gamepad was unplugged. Plug it in" in desk.notice.text
+    desk.press(Control.NEXT)
+    assert session.phase is Phase.PAUSED
+    pad.plugged = True
+    desk.press(Control.NEXT)
+    tick_until(desk, lambda: session.success)
+    assert session.phase is Phase.RECORDING
+
+
+def test_without_a_gamepad_the_keyboard_is_offered(monkeypatch, peg_setup):
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.init()
+    with pytest.raises(DeviceLost, match="no gamepad found; plug it in, or .* --device keyboard"):
+        Gamepad(peg_setup).connect()
+    pygame.display.quit()
+
+
+def test_without_pygame_the_extra_is_named(monkeypatch, peg_setup):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(MissingExtra, match=r"pip install sart_toolkit\[teleop\]"):
+        Gamepad(peg_setup).connect()
