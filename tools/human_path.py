@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.errors import SartError
+from sart_toolkit.errors import SartError, unknown_name
 from sart_toolkit.poses import Array, relative_motion
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
@@ -49,10 +49,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for folder in (options.directory, pictures):
             folder.mkdir(parents=True, exist_ok=True)
         for stage in options.stages:
+            if stage not in STAGES:
+                raise unknown_name("stage", stage, STAGES)
             started = time.monotonic()
             said = STAGES[stage](options.task, options.directory, pictures)
             print(f"{stage:<9} {time.monotonic() - started:6.1f} s  {said}")
-    except (SartError, TimeoutError, KeyError) as error:
+    except (SartError, TimeoutError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0

@@ -9,7 +9,8 @@ import numpy as np
 
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.cli.arguments import Record
-from sart_toolkit.errors import Discarded, InvalidInput
+from sart_toolkit.cli.console import say
+from sart_toolkit.errors import Discarded, InvalidInput, NoDisplay
 from sart_toolkit.motion.controller import ControllerConfig
 from sart_toolkit.records import CONTROL_HZ, Demonstration
 from sart_toolkit.robots.model import RobotModel
@@ -50,8 +51,9 @@ def record_by_hand(
     if args.status is not None:
         check_writable(args.status, args.overwrite)
         remove(args.status)
-    start_sdl()
+    desk: RecordingDesk | None = None
     try:
+        start_sdl()
         device.connect()
         robot = backend.robot
         # No joint goes faster than it can, so nothing jumps near the edge of what can be reached.
@@ -66,6 +68,12 @@ def record_by_hand(
         desk = RecordingDesk(session, device, save, watch)
         with Screen(f"sart record {task.name}") as screen:
             RecordingWindow(desk, screen, str(args.out)).run()
+    except KeyboardInterrupt:
+        if desk is None or desk.demonstration is None:
+            say("sart: the recording was cut off, nothing was written")
+        raise
+    except NoDisplay as error:
+        raise NoDisplay(f"{error}; or let a script steer: --device scripted") from error
     finally:
         device.close()
     if desk.demonstration is None:

@@ -103,7 +103,7 @@ class RecordingDesk:
             why = "not kept for long enough"
         text = f"Goal not reached: {why}."
         if session.end is End.TIME:
-            text = f"{session.config.max_seconds:.0f} s are over. {text}"
+            text = f"{session.config.max_seconds:g} s are over. {text}"
         return Notice(f"{text} ← records again; → twice saves it nevertheless.", "warning")
 
     def tick(self) -> None:

@@ -451,7 +451,7 @@ def record_demonstration(
             progress(steps / RECORD_HZ)
     if session.end is End.TIME:
         raise InvalidInput(
-            f"the demonstration did not end within {session.config.max_seconds:.0f} s: "
+            f"the demonstration did not end within {session.config.max_seconds:g} s: "
             f"{task.shortfall(session.observation)}; steer on, or allow more with max_seconds"
         )
     return session.demonstration(device.operator, device.name, session.steps / RECORD_HZ, seed)

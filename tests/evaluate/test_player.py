@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
+from sart_toolkit.backends import make_backend
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.evaluate.player import Playback, PlayWindow, SceneView, film
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scene.demonstrated import DemonstratedScene
+from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks.task import Placement
+from sart_toolkit.teach.scripted import ScriptedOperator
+from sart_toolkit.teach.session import record_demonstration
+from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 
 @pytest.fixture
@@ -69,20 +81,6 @@ def test_a_segment_s_robot_is_where_its_joints_were(episode, peg_backend, peg_da
 
 
 def test_what_is_carried_moves_with_the_tool_in_a_segment(tmp_path):
-    import functools
-
-    from sart_toolkit.augment.config import AugmentConfig
-    from sart_toolkit.augment.engine import augment_demonstration
-    from sart_toolkit.backends import make_backend
-    from sart_toolkit.robots import get_robot
-    from sart_toolkit.robots.model import RobotModel
-    from sart_toolkit.scene.demonstrated import DemonstratedScene
-    from sart_toolkit.tasks import get_task
-    from sart_toolkit.tasks.task import Placement
-    from sart_toolkit.teach.scripted import ScriptedOperator
-    from sart_toolkit.teach.session import record_demonstration
-    from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
-
     task = get_task("toolbox_picking")
     robot = get_robot(task.robot)
     make = functools.partial(make_backend, "pybullet", robot, task.scene, 32)

@@ -96,7 +96,8 @@ def test_every_phase_looks_different_and_shows_the_scene(pygame, window):
 
     def look():
         window.draw()
-        pictures[window._desk.session.phase] = drawn(pygame)
+        picture = pygame.surfarray.array3d(window._screen._canvas)
+        pictures[window._desk.session.phase] = picture
 
     look()
     window._take(Key("right", True))
@@ -197,5 +198,8 @@ def test_without_pygame_the_extra_is_named(monkeypatch):
         start_sdl()
 
 
-def test_the_window_s_size_is_the_design_s(screen, pygame):
-    assert pygame.display.get_surface().get_size() == (screens.WIDTH, screens.HEIGHT)
+def test_on_a_small_desktop_the_window_is_smaller_and_of_the_same_shape(screen, pygame):
+    (wide, high), *_ = pygame.display.get_desktop_sizes()
+    width, height = pygame.display.get_surface().get_size()
+    assert width <= wide and height <= high
+    assert width / height == pytest.approx(screens.WIDTH / screens.HEIGHT, rel=0.01)
