@@ -81,7 +81,8 @@ def record(name: str, directory: Path, pictures: Path) -> str:
         desktop.key("Right")
         for leg in task.plan(task.initial_state(model, Placement())):
             hands.steer(leg)
-            desktop.screenshot(pictures / "record_recording.png")
+            if hands.look()["phase"] == "recording":
+                desktop.screenshot(pictures / "record_recording.png")
         hands.see("phase", "ended")
         desktop.screenshot(pictures / "record_ended.png")
         desktop.key("Right")

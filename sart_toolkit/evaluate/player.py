@@ -319,7 +319,12 @@ class PlayWindow:
         for row, (keys, what) in enumerate(rows):
             screen.text((768, 496 + 30 * row), keys, 15, BRIGHT, bold=True)
             screen.text((880, 496 + 30 * row), what, 15, TEXT)
-        screen.text((768, 704), f"{self._speed:g} times real time", 13, FAINT)
+        screen.text(
+            (768, 704),
+            "in real time" if self._speed == 1 else f"{self._speed:g} times real time",
+            13,
+            FAINT,
+        )
         self._timeline()
         screen.show()
 

@@ -249,7 +249,7 @@ class RecordingWindow:
                 self._row((1096, 608 + 24 * i), keys, what, 58)
         for i, (keys, what) in enumerate((("1 2 3", "speed"), ("F", "directions"))):
             self._row((1096, 680 + 24 * i), keys, what, 58)
-        self._row((1096, 728), "Space", "gripper", 52)
+        self._row((1096, 728), "Space", "gripper", 58)
         share = self._pace.share
         words = "in real time" if share > 0.97 else f"at {share:.0%} of real time"
         screen.text((1254, 760), words, 13, FAINT if share > 0.97 else ORANGE, align="right")

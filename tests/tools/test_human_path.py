@@ -20,7 +20,7 @@ def test_a_demonstration_is_recorded_by_keys_alone_in_the_real_window(tmp_path, 
     check_desktop()
     pytest.importorskip("pygame")
     assert human_path.main([str(tmp_path), "--stages", "record"]) == 0
-    assert capsys.readouterr().out.startswith("record")
+    assert "record " in capsys.readouterr().out
     shown = load_demonstration(tmp_path / "demo.h5")
     assert shown.success[-10:].all() and shown.device == "keyboard"
     assert shown.operator == "machine hands"

@@ -51,7 +51,7 @@ class SpaceMouse(ManualDevice):
                 f"a SpaceMouse needs hidapi ({error}); pip install sart_toolkit[teleop]"
             ) from error
         self.close()
-        found = sorted(filter(_is_spacemouse, hid.enumerate()), key=_preference)
+        found = sorted(filter(is_spacemouse, hid.enumerate()), key=_preference)
         if not found:
             raise DeviceLost("no SpaceMouse found; plug it in, or record with --device keyboard")
         device = hid.device()
@@ -114,7 +114,8 @@ class SpaceMouse(ManualDevice):
             self.next_speed()
 
 
-def _is_spacemouse(info: dict[str, Any]) -> bool:
+def is_spacemouse(info: dict[str, Any]) -> bool:
+    """Whether what hidapi tells of a device is a SpaceMouse's."""
     known = {_LOGITECH: _LOGITECH_PRODUCTS, _3DCONNEXION: _3DCONNEXION_PRODUCTS}
     if info["vendor_id"] not in known:
         return False
