@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from sart_toolkit.errors import SartError
+from sart_toolkit.errors import NoDisplay, SartError
 
 DISK_NEEDED_GB = 2.0
 _ARM = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute">
@@ -294,9 +294,12 @@ def probe_teleop_window() -> str:
 
     from sart_toolkit.teach.screen import Screen
 
-    with Screen("sart doctor") as screen:
-        screen.clear()
-        screen.show()
+    try:
+        with Screen("sart doctor") as screen:
+            screen.clear()
+            screen.show()
+    except NoDisplay as error:
+        raise ProbeFailed(str(error).partition(";")[0]) from error
     return f"{_version('pygame-ce')}, opens on display {os.environ.get('DISPLAY', '')}".strip()
 
 
