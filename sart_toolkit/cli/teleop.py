@@ -10,7 +10,7 @@ import numpy as np
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.cli.arguments import Record
 from sart_toolkit.cli.console import say
-from sart_toolkit.errors import Discarded, InvalidInput, NoDisplay
+from sart_toolkit.errors import Discarded, InvalidInput, MissingCapability, NoDisplay
 from sart_toolkit.motion.controller import ControllerConfig
 from sart_toolkit.records import CONTROL_HZ, Demonstration
 from sart_toolkit.robots.model import RobotModel
@@ -35,6 +35,7 @@ def record_by_hand(
 
     Raises:
         Discarded: the person threw it away.
+        MissingCapability: the backend draws no pictures.
         DeviceLost: there is nothing to steer with.
         NoDisplay: no window can be opened.
         MissingExtra: a library isn't installed.
@@ -48,6 +49,10 @@ def record_by_hand(
         if args.status is not None:
             append_json_line(args.status, status)
 
+    if not backend.capabilities.renders:
+        raise MissingCapability(
+            f"backend {backend.name!r} draws no pictures to steer by; use another backend"
+        )
     if args.status is not None:
         check_writable(args.status, args.overwrite)
         remove(args.status)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sart_toolkit.errors import CannotWrite, DeviceLost
+from sart_toolkit.errors import DeviceLost, SartError
 from sart_toolkit.records import Demonstration
 from sart_toolkit.teach.devices.manual import Control, ManualDevice
 from sart_toolkit.teach.session import End, Phase, TeleopSession
@@ -52,7 +52,7 @@ class RecordingDesk:
         Args:
             session: the recording.
             device: what the person steers with, connected.
-            save: writes a demonstration; if it raises `CannotWrite` it can be tried again.
+            save: writes a demonstration; if it raises a `SartError` it can be tried again.
             watch: called with JSON values after each 10 Hz step and each change of phase.
         """
         self.session, self.device = session, device
@@ -197,7 +197,7 @@ class RecordingDesk:
         shown = session.demonstration(device.operator, device.name, session.seconds_spent)
         try:
             self._save(shown)
-        except CannotWrite as error:
+        except SartError as error:
             self._said = Notice(f"Not saved: {error}. → tries again; nothing is lost.", "bad")
             return
         self.demonstration = shown

@@ -10,9 +10,16 @@ import sys
 import imageio_ffmpeg
 import pytest
 
+from sart_toolkit.backends.interface import Capabilities
+from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.cli import main
 from sart_toolkit.errors import CannotWrite
-from sart_toolkit.storage import load_demonstration, read_json_lines, save_demonstration
+from sart_toolkit.storage import (
+    load_demonstration,
+    read_json_lines,
+    save_demonstration,
+    save_episode,
+)
 from sart_toolkit.testing.desktop import Desktop, check_desktop
 
 SART = (sys.executable, "-c", "from sart_toolkit.cli import main; main()")
@@ -137,6 +144,14 @@ def test_what_can_t_be_steered_with_is_one_line(tmp_path, capsys, dummy, options
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_backend_that_draws_nothing_can_t_be_steered_by_hand(
+    tmp_path, capsys, dummy, monkeypatch
+):
+    monkeypatch.setattr(PyBulletBackend, "capabilities", Capabilities(True, True, False, True))
+    said = error(capsys, *RECORD, tmp_path / "d.h5", *BY_HAND)
+    assert "backend 'pybullet' draws no pictures to steer by" in said
+
+
 @pytest.mark.window
 def test_ctrl_c_while_recording_ends_cleanly_and_leaves_nothing(tmp_path, wait_until):
     check_desktop()
@@ -161,8 +176,6 @@ def test_ctrl_c_while_recording_ends_cleanly_and_leaves_nothing(tmp_path, wait_u
 @pytest.fixture
 def dataset(tmp_path, demo, peg_dataset):
     """A dataset's directory as far as `play` looks at it."""
-    from sart_toolkit.storage import save_episode
-
     path = tmp_path / "data"
     (path / "episodes").mkdir(parents=True)
     shutil.copy(demo, path / "demo.h5")

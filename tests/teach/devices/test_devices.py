@@ -9,7 +9,7 @@ import pytest
 
 from sart_toolkit.errors import DeviceLost, InvalidInput, UnknownName
 from sart_toolkit.teach.devices import DEVICES, make_device
-from sart_toolkit.teach.devices.manual import SPEEDS, Control, ManualDevice
+from sart_toolkit.teach.devices.manual import SPEEDS, Control, ManualDevice, views
 from sart_toolkit.teach.session import TeleopCommand
 
 
@@ -89,6 +89,17 @@ def test_tool_directions_are_those_of_the_wrist_view(puppet, make_session):
     assert right[0] == pytest.approx(0.06)
     assert forward[1] < -0.03
     assert up[2] < -0.03, "out of the picture, back along the tool"
+
+
+def test_without_a_camera_in_the_scene_the_person_stands_behind_the_robot(peg_model, peg_task):
+    R = views(peg_model, dataclasses.replace(peg_task.scene, cameras=())).R_world_hand
+    np.testing.assert_allclose(R, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+
+
+def test_a_wrist_camera_mounted_a_little_askew_does_not_tilt_the_directions(peg_model, peg_task):
+    straight = views(peg_model, peg_task.scene).R_tool_hand
+    np.testing.assert_array_equal(straight, np.round(straight))
+    assert np.linalg.det(straight) == pytest.approx(1.0)
 
 
 def _pushed(device, axis, by=1.0):
