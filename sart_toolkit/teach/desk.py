@@ -80,18 +80,18 @@ class RecordingDesk:
             case Phase.SAVED:
                 return Notice("Saved.", "good")
         if session.trouble:
-            return Notice(f"{session.trouble}: the tool stays here; steer back", "bad")
+            return Notice(f"The tool stays here: {session.trouble}. Steer back.", "bad")
         touch = ""
         if session.contacts:
             firmest = session.contacts[0]
             touch = f"{firmest.a} / {firmest.b}, {firmest.force:.0f} N"
             if firmest.force > FIRM:
-                return Notice(f"pressing hard: {touch}; ease off", "bad")
+                return Notice(f"Pressing hard: {touch}. Ease off.", "bad")
         if session.success:
             left = max(0.0, session.task.hold - session.success_held)
             return Notice(f"Goal reached. Keep it for another {left:.1f} s", "good")
         if touch:
-            return Notice(f"contact: {touch}", "warning")
+            return Notice(f"Contact: {touch}", "warning")
         return Notice("Recording. → ends it, ← starts again.")
 
     def _ended_notice(self) -> Notice:

@@ -242,7 +242,7 @@ class RecordingWindow:
         view = "scene" if desk.device.frame == "world" else "wrist"
         screen.text((814, 584), f"{desk.device.name}, directions as in the {view} view", 13, FAINT)
         for i, (keys, what) in enumerate(desk.device.key_map):
-            self._row((814, 608 + 24 * i), keys, what, 84)
+            self._row((814, 608 + 24 * i), keys, what, 96)
         meanings = _MEANINGS[desk.session.phase]
         for i, (keys, what) in enumerate(zip(["→", "←", "Esc"], meanings, strict=True)):
             if what:

@@ -175,14 +175,14 @@ def test_trouble_and_contact_are_told_at_once(desk, keyboard, tick_until):
     keyboard.key("d", True)
     tick_until(desk, lambda: "block / peg" in desk.notice.text or "peg / table" in desk.notice.text)
     assert desk.notice.tone in ("warning", "bad")
-    tick_until(desk, lambda: "pressing hard" in desk.notice.text)
+    tick_until(desk, lambda: "Pressing hard" in desk.notice.text)
     assert desk.notice.tone == "bad"
     keyboard.key("q", False)
     keyboard.key("e", True)
     tick_until(desk, lambda: not desk.session.contacts)
     keyboard.key("d", False)
     tick_until(desk, lambda: bool(desk.session.trouble), seconds=30)
-    assert "the tool stays here; steer back" in desk.notice.text
+    assert "The tool stays here: " in desk.notice.text
 
 
 def test_success_tells_how_long_to_keep_it(desk, keyboard, tick_until):

@@ -49,7 +49,7 @@ class Gamepad(ManualDevice):
         ("Triggers", "down (left), up (right)"),
         ("Right stick", "tip away, near; turn"),
         ("D-pad ← →", "tip left, right"),
-        ("A   Y", "gripper, frame"),
+        ("A   Y", "gripper, directions"),
         ("LB RB", "slower, faster"),
         ("Start Back", "as → and ←"),
     )
