@@ -112,8 +112,8 @@ class _Hands:
         self._gripper: float | None = None
 
     def look(self) -> dict[str, Any]:
-        """What the window shows now."""
-        if self._program.poll() is not None:
+        """What the window shows now, or showed last before it closed in good order."""
+        if self._program.poll():
             said, errors = self._program.communicate()
             raise TimeoutError(f"the window closed: {errors}{said}")
         rows = read_json_lines(self._status)

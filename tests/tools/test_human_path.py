@@ -25,8 +25,6 @@ def test_a_demonstration_is_recorded_by_keys_alone_in_the_real_window(tmp_path, 
     assert shown.success[-10:].all() and shown.device == "keyboard"
     assert shown.operator == "machine hands"
     assert shown.seconds >= shown.timestamps[-1] * 0.9
-    # Nothing was pressed hard on the way.
-    assert shown.steps.contact_force.max() < 100
     for phase in ("ready", "recording", "ended", "saved"):
         with Image.open(tmp_path / "pictures" / f"record_{phase}.png") as picture:
             assert picture.size == (1280, 800)
