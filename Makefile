@@ -50,6 +50,6 @@ $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
 	@touch $@
 
 $(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh
-	bash tools/setup_debian.sh annotate
+	bash tools/setup_debian.sh annotate teleop
 	$(PIP_INSTALL) -e '.[dev,sapien,planning,teleop,annotate]'
 	@touch $@

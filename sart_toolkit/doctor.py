@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from sart_toolkit.errors import SartError
+from sart_toolkit.errors import NoDisplay, SartError
 
 DISK_NEEDED_GB = 2.0
 _ARM = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute">
@@ -288,6 +288,31 @@ def probe_open3d_window() -> str:
     return f"opens on display {os.environ['DISPLAY']}"
 
 
+def probe_teleop_window() -> str:
+    """Which display showed a window of pygame's."""
+    import pygame  # noqa: F401 - its absence has a remedy of its own
+
+    from sart_toolkit.teach.screen import Screen
+
+    try:
+        with Screen("sart doctor") as screen:
+            screen.clear()
+            screen.show()
+    except NoDisplay as error:
+        raise ProbeFailed(str(error).partition(";")[0]) from error
+    return f"{_version('pygame-ce')}, opens on display {os.environ.get('DISPLAY', '')}".strip()
+
+
+def probe_spacemouse() -> str:
+    """What hidapi is, and whether it finds a SpaceMouse; none is no fault."""
+    import hid
+
+    from sart_toolkit.teach.devices.spacemouse import is_spacemouse
+
+    found = [info["product_string"] for info in hid.enumerate() if is_spacemouse(info)]
+    return f"{_version('hidapi')}, finds {', '.join(found) or 'none plugged in'}"
+
+
 def probe_cuda() -> str:
     """Which CUDA device computed something with torch."""
     import torch
@@ -423,5 +448,18 @@ PROBES: Sequence[Probe] = (
         extra="annotate",
         remedy="work on a desktop, or give it a virtual display: xvfb-run -a COMMAND (in a "
         f"checkout, to install that: {_SUDO}bash tools/setup_debian.sh annotate)",
+    ),
+    Probe(
+        "pygame window",
+        "sart_toolkit.doctor:probe_teleop_window",
+        extra="teleop",
+        remedy="work on a desktop, or give it a virtual display: xvfb-run -a COMMAND (in a "
+        f"checkout, to install that: {_SUDO}bash tools/setup_debian.sh teleop)",
+    ),
+    Probe(
+        "SpaceMouse",
+        "sart_toolkit.doctor:probe_spacemouse",
+        extra="teleop",
+        remedy="reinstall: pip install --force-reinstall hidapi; other devices steer as well",
     ),
 )

@@ -50,6 +50,18 @@ class MissingExtra(SartError, ImportError):
     """An optional dependency is not installed; the message says how to install it."""
 
 
+class NoDisplay(SartError, RuntimeError):
+    """No window can be opened here; the message says what works without one."""
+
+
+class DeviceLost(SartError, ConnectionError):
+    """What a person steers with isn't there, or no longer answers."""
+
+
+class Discarded(SartError, RuntimeError):
+    """A person threw away what they had made; nothing was written."""
+
+
 class Mismatch(SartError, ValueError):
     """Two things that belong together don't: an annotation and another demonstration, say."""
 

@@ -396,6 +396,21 @@ def load_episode(path: Path) -> Episode:
         return episode
 
 
+def load_recording(path: Path) -> Demonstration | Episode:
+    """The demonstration or the episode in an HDF5 file.
+
+    Raises:
+        MissingFile: no such file.
+        BrokenFile: truncated or another kind of file.
+    """
+    try:
+        return load_demonstration(path)
+    except BrokenFile as error:
+        if "holds 'episode'" not in str(error):
+            raise
+    return load_episode(path)
+
+
 # --- annotations and datasets -------------------------------------------------------------------
 
 _ANNOTATION_NOTE = (

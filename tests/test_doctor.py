@@ -13,6 +13,7 @@ import torch
 
 from sart_toolkit import doctor
 from sart_toolkit.doctor import Finding, Probe, ProbeFailed, diagnose, run_probe
+from sart_toolkit.testing.desktop import Desktop
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,8 @@ def test_everything_is_looked_at(findings: list[Finding]) -> None:
         "SAPIEN rendering",
         "Open3D off-screen",
         "Open3D window",
+        "pygame window",
+        "SpaceMouse",
         "CUDA",
         "threads",
         "disk",
@@ -176,6 +179,27 @@ def test_a_window_without_a_display_is_caught(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ProbeFailed, match="DISPLAY is not set"):
         doctor.probe_open3d_window()
+
+
+@pytest.mark.window
+def test_a_window_of_pygame_s_that_opened_is_told_with_its_display(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("pygame")
+    with Desktop(640, 480) as desktop:
+        monkeypatch.setenv("DISPLAY", desktop.display)
+        (probe,) = (probe for probe in doctor.PROBES if probe.name == "pygame window")
+        finding = run_probe(probe)
+    assert finding.ok and f"opens on display {desktop.display}" in finding.detail
+
+
+def test_a_spacemouse_is_named_and_none_is_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    plugged = [{"vendor_id": 0x256F, "product_id": 0xC635, "product_string": "SpaceMouse Compact"}]
+    hid = types.SimpleNamespace(enumerate=lambda: plugged)
+    monkeypatch.setitem(sys.modules, "hid", hid)
+    assert "finds SpaceMouse Compact" in doctor.probe_spacemouse()
+    plugged.clear()
+    assert "none plugged in" in doctor.probe_spacemouse()
 
 
 def test_wrong_physics_and_an_empty_picture_are_caught() -> None:

@@ -3,11 +3,11 @@
 # than root it prints the command to type instead, and exits with 1. On another system it only
 # names the packages.
 #
-# Usage: bash tools/setup_debian.sh GROUP...      groups: python core sapien annotate
+# Usage: bash tools/setup_debian.sh GROUP...      groups: python core sapien annotate teleop
 set -euo pipefail
 
 usage() {
-    echo "usage: bash tools/setup_debian.sh GROUP... (groups: python core sapien annotate)" >&2
+    echo "usage: bash tools/setup_debian.sh GROUP... (groups: python core sapien annotate teleop)" >&2
     exit 2
 }
 
@@ -21,6 +21,11 @@ packages_of() {
         # Open3D draws through Vulkan, and any Mesa will do.
         annotate)
             echo "libegl1 libgl1 libgomp1 libusb-1.0-0 libvulkan1 mesa-vulkan-drivers" \
+                "xauth xdotool xvfb"
+            ;;
+        # SDL, which pygame-ce brings, looks for these when it opens a window.
+        teleop)
+            echo "libudev1 libx11-6 libxcursor1 libxext6 libxfixes3 libxi6 libxrandr2 libxss1" \
                 "xauth xdotool xvfb"
             ;;
         *) usage ;;

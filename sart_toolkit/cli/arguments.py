@@ -70,9 +70,11 @@ class Run:
 
 @dataclass(frozen=True)
 class Record:
-    """Record one demonstration by the scripted operator.
+    """Record one demonstration: steered by you, in a window, or by the scripted operator.
 
     Example: sart record peg_in_hole --out demo.h5
+
+    Example: sart record peg_in_hole --out demo.h5 --device keyboard
 
     Example: sart record toolbox_picking --out demo.h5 --backend sapien
 
@@ -81,8 +83,23 @@ class Record:
 
     task: _TASK
     out: Annotated[Path, arg(help="HDF5 file to write.")]
+    device: Annotated[str, arg(help="What steers: keyboard, spacemouse, gamepad, or scripted.")] = (
+        "scripted"
+    )
     backend: _BACKEND = "pybullet"
     robot: _ROBOT = None
+    frame: Annotated[
+        Literal["world", "tool"] | None,
+        arg(help="What your directions are fixed to at first: world, or tool. F changes it."),
+    ] = None
+    operator: Annotated[
+        str | None, arg(help="Who steers, kept with the demonstration; 'person' if left out.")
+    ] = None
+    max_seconds: Annotated[float, arg(help="Longest demonstration [s].")] = 120.0
+    status: Annotated[
+        Path | None,
+        arg(help="File for other programs to watch: one JSON line for each recorded step."),
+    ] = None
     seed: _SEED = 0
     placement: Annotated[
         Literal["middle", "random"], arg(help="Where the object stands in its range.")
@@ -90,6 +107,34 @@ class Record:
     yaw_deg: _YAW = 0.0
     vary_looks: _LOOKS = False
     image_size: _IMAGE = 128
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Play:
+    """Look at a demonstration or an episode again, in a window or as an MP4 film.
+
+    Example: sart play demo.h5
+
+    Example: sart play dataset/episodes/sphere00_k00000.h5 --out episode.mp4
+
+    Example: sart play demo.h5 --camera wrist --out wrist.mp4 --speed 0.5
+    """
+
+    file: Annotated[
+        Positional[Path], arg(metavar="FILE", help="Demonstration, or an episode in its dataset.")
+    ]
+    out: Annotated[Path | None, arg(help="MP4 file to write; shown in a window if left out.")] = (
+        None
+    )
+    camera: Annotated[
+        str, arg(help="A camera of the scene, drawn again; or a recorded one, such as wrist.")
+    ] = "overview"
+    speed: Annotated[float, arg(help="Times real time.")] = 1.0
+    backend: Annotated[
+        str | None, arg(help="What draws the scene; the recording's backend if left out.")
+    ] = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -401,6 +446,7 @@ class Doctor:
 Verb = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Record, tyro.conf.subcommand("record")]
+    | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Suggest, tyro.conf.subcommand("suggest")]
     | Annotated[Augment, tyro.conf.subcommand("augment")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]

@@ -32,6 +32,7 @@ from sart_toolkit.cli.arguments import (
     BenchmarkSkill,
     Evaluate,
     Info,
+    Play,
     Record,
     Run,
     Suggest,
@@ -39,6 +40,8 @@ from sart_toolkit.cli.arguments import (
     Validate,
 )
 from sart_toolkit.cli.console import progress_bar, say, show
+from sart_toolkit.cli.play import check_play_options, load_playback, play
+from sart_toolkit.cli.teleop import check_hand_options, record_by_hand
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
 from sart_toolkit.evaluate.benchmark import (
     BenchmarkConfig,
@@ -47,6 +50,7 @@ from sart_toolkit.evaluate.benchmark import (
     benchmark_replay,
 )
 from sart_toolkit.evaluate.clouds import benchmark_clouds
+from sart_toolkit.evaluate.player import SceneView
 from sart_toolkit.evaluate.radii import RadiiConfig, benchmark_radii
 from sart_toolkit.evaluate.report import write_report
 from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
@@ -66,7 +70,7 @@ from sart_toolkit.storage import (
     load_dataset,
     load_dataset_info,
     load_demonstration,
-    load_episode,
+    load_recording,
     read_json,
     save_annotation,
     save_demonstration,
@@ -75,8 +79,9 @@ from sart_toolkit.storage import (
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.teach.cloud import CloudSurroundings
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import record_demonstration
+from sart_toolkit.teach.devices import make_device
+from sart_toolkit.teach.devices.manual import ManualDevice
+from sart_toolkit.teach.session import DeviceSetup, SessionConfig, record_demonstration
 from sart_toolkit.teach.suggest import (
     ExactSurroundings,
     SuggestConfig,
@@ -130,16 +135,44 @@ def record_verb(args: Record) -> Result:
         raise InvalidInput("--yaw-deg: turns random placements only; add --placement random")
     with closing(make()) as backend:
         model = RobotModel(backend.robot, backend.scene.held)
-        device = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
-        with progress_bar("record", None, "s") as bar:
-            demonstration = record_demonstration(
-                backend, task, model, device, placement, args.seed,
-                progress=lambda seconds: bar.update(seconds - bar.n),
-            )  # fmt: skip
-    if not task.achieved(demonstration.success):
-        raise Mismatch("the demonstration did not reach the goal; record again with another --seed")
-    save_demonstration(args.out, demonstration)
+        state = task.initial_state(model, placement)
+        device = make_device(
+            args.device,
+            DeviceSetup(
+                backend, task, model, state, rng, args.frame or "world", args.operator or "person"
+            ),
+        )
+        check_hand_options(args, device.interactive)
+        if isinstance(device, ManualDevice):
+            demonstration = record_by_hand(args, backend, task, model, device, placement)
+        else:
+            config = SessionConfig(max_seconds=args.max_seconds)
+            with progress_bar("record", None, "s") as bar:
+                demonstration = record_demonstration(
+                    backend, task, model, device, placement, args.seed, config,
+                    progress=lambda seconds: bar.update(seconds - bar.n),
+                )  # fmt: skip
+            if not task.achieved(demonstration.success):
+                raise Mismatch(
+                    "the demonstration did not reach the goal; record again with another --seed"
+                )
+            save_demonstration(args.out, demonstration)
     return {"demonstration": str(args.out), **_describe_demonstration(demonstration)}
+
+
+def play_verb(args: Play) -> Result:
+    """`sart play`."""
+    check_play_options(args)
+    playback = load_playback(args.file)
+    shown = playback.demonstration
+    if args.camera in shown.steps.cameras:
+        playback.camera = args.camera
+        return play(args, playback, None)
+    make = _backend_factory(
+        args.backend or shown.backend, get_task(shown.task), shown.robot, _image_size(shown)
+    )
+    with closing(make()) as backend:
+        return play(args, playback, SceneView(playback, backend, args.camera))
 
 
 def suggest_verb(args: Suggest) -> Result:
@@ -337,7 +370,8 @@ def run_whole(args: Run) -> Result:
     skill, evaluation = out / "skill", out / "evaluation.json"
     steps: list[tuple[str, Path, Callable[[], Result]]] = [
         ("record", demo, lambda: record_verb(Record(
-            args.task, demo, args.backend, args.robot, args.seed, image_size=args.image_size
+            args.task, demo, backend=args.backend, robot=args.robot, seed=args.seed,
+            image_size=args.image_size,
         ))),
         ("suggest", annotation, lambda: suggest_verb(Suggest(demo, annotation))),
         ("augment", dataset / "dataset.json", lambda: augment_verb(Augment(
@@ -558,13 +592,10 @@ def info_verb(args: Info) -> Result:
         if "success_rate" in value:
             return {"kind": "evaluation", **_without_rows(value)}
         raise BrokenFile(f"{path}: neither an annotation nor an evaluation; pass another file")
-    try:
-        return {"kind": "demonstration", **_describe_demonstration(load_demonstration(path))}
-    except BrokenFile as error:
-        if "holds 'episode'" not in str(error):
-            raise
-    episode = load_episode(path)
-    return {"kind": "episode", "steps": len(episode), **_plain(episode.provenance)}
+    recording = load_recording(path)
+    if isinstance(recording, Demonstration):
+        return {"kind": "demonstration", **_describe_demonstration(recording)}
+    return {"kind": "episode", "steps": len(recording), **_plain(recording.provenance)}
 
 
 def _describe_demonstration(demonstration: Demonstration) -> Result:
@@ -579,6 +610,8 @@ def _describe_demonstration(demonstration: Demonstration) -> Result:
         "placement": dict(d.task_parameters.get("placement", {})),
         "cameras": {k: "x".join(map(str, c.rgb.shape[1:3])) for k, c in d.steps.cameras.items()},
         "operator": d.operator,
+        "device": d.device,
+        "seconds_spent": round(d.seconds, 1),
         "content_hash": d.content_hash(),
     }
 
@@ -623,6 +656,7 @@ def _plain(record: Any) -> Result:
 _VERBS: dict[type, Callable[[Any], Result]] = {
     Run: run_whole,
     Record: record_verb,
+    Play: play_verb,
     Suggest: suggest_verb,
     Augment: augment_verb,
     Validate: validate_verb,

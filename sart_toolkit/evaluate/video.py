@@ -234,26 +234,41 @@ def caption(
     Raises:
         InvalidInput: wrong shape or dtype, an unknown outcome, or time not finite.
     """
+    words = f"episode {episode}" + (f" · {detail}" if detail else "")
+    return strip(frame, words, seconds, outcome)
+
+
+def strip(frame: Image, words: str, seconds: float, outcome: Outcome | None = None) -> Image:
+    """A copy of `frame` with a strip below it: words and time, after the outcome in its colour.
+
+    Args:
+        frame: uint8 `(H, W, 3)`; the result is taller by an even number of rows.
+        words: what is said of it, cut where there is no room.
+        seconds: time since it began [s].
+        outcome: how it ends; `None` leaves it out.
+
+    Raises:
+        InvalidInput: wrong shape or dtype, an unknown outcome, or time not finite.
+    """
     check_frame("frame", frame)
     if outcome is not None and outcome not in OUTCOME_COLOURS:
         raise InvalidInput(f"outcome: expected 'success', 'failure' or None, got {outcome!r}")
     if not np.isfinite(seconds):
         raise InvalidInput(f"seconds: expected a finite time, got {seconds}")
     height, width = frame.shape[:2]
-    strip = 2 * max(9, round(0.032 * height))
-    canvas = PillowImage.new("RGB", (width, height + strip), _STRIP)
+    rows = 2 * max(9, round(0.032 * height))
+    canvas = PillowImage.new("RGB", (width, height + rows), _STRIP)
     canvas.paste(PillowImage.fromarray(np.ascontiguousarray(frame)), (0, 0))
     draw = ImageDraw.Draw(canvas)
-    text, pad, middle = font(max(9, round(0.55 * strip))), strip // 3, height + strip / 2
+    text, pad, middle = font(max(9, round(0.55 * rows))), rows // 3, height + rows / 2
     clock = f"{seconds:.1f} s"
     x, end = float(pad), width - pad - text.getlength(clock)
     draw.text((width - pad, middle), clock, fill=_STRIP_TEXT, font=text, anchor="rm")
     if outcome is not None:
         right = x + text.getlength(outcome) + pad
-        draw.rectangle((0, height, right, height + strip), fill=OUTCOME_COLOURS[outcome])
+        draw.rectangle((0, height, right, height + rows), fill=OUTCOME_COLOURS[outcome])
         draw.text((x, middle), outcome, fill="white", font=text, anchor="lm")
         x = right + pad
-    words = f"episode {episode}" + (f" · {detail}" if detail else "")
     while words and x + text.getlength(words) > end - pad:
         words = words[:-2].rstrip(" ·…") + "…" if len(words) > 2 else ""
     draw.text((x, middle), words, fill=_STRIP_TEXT, font=text, anchor="lm")

@@ -12,7 +12,7 @@ from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import check_positive, relative_motion
 from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.tasks.task import Stage
-from sart_toolkit.teach.session import Device, TeleopCommand
+from sart_toolkit.teach.session import Device, DeviceSetup, TeleopCommand
 
 
 @dataclass(frozen=True)
@@ -111,3 +111,8 @@ class ScriptedOperator(Device):
         self._tremor = keep * self._tremor + noise * spread * (0.0 if resting else 1.0)
         stop = self._still > style.rest
         return TeleopCommand(self._velocity + self._tremor, stage.gripper, stop)
+
+
+def scripted_operator(setup: DeviceSetup) -> ScriptedOperator:
+    """The operator for a recording, following its task's plan."""
+    return ScriptedOperator(setup.task.plan(setup.state), setup.rng)

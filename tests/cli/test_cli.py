@@ -302,7 +302,17 @@ def test_a_demonstration_that_fails_is_not_saved(
 
 
 def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    for verb in ("run", "record", "suggest", "augment", "train", "evaluate", "info", "doctor"):
+    for verb in (
+        "run",
+        "record",
+        "play",
+        "suggest",
+        "augment",
+        "train",
+        "evaluate",
+        "info",
+        "doctor",
+    ):
         with pytest.raises(SystemExit) as exit_:
             main([verb, "--help"])
         assert exit_.value.code == 0

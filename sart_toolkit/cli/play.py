@@ -1,0 +1,90 @@
+"""Looking at recordings, for `sart play`: which one a path names, and window or film."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sart_toolkit.cli.arguments import Play
+from sart_toolkit.cli.console import progress_bar
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile
+from sart_toolkit.evaluate.player import Playback, PlayWindow, SceneView, film
+from sart_toolkit.evaluate.video import write_video
+from sart_toolkit.poses import check_positive
+from sart_toolkit.records import RECORD_HZ, Demonstration
+from sart_toolkit.storage import check_writable, load_demonstration, load_recording
+from sart_toolkit.teach.screen import Screen
+
+
+def load_playback(path: Path) -> Playback:
+    """The demonstration in a file, or the episode with the demonstration of its dataset.
+
+    Raises:
+        MissingFile: no such file, or the episode is outside its dataset.
+        BrokenFile: something else than a recording.
+        Mismatch: the dataset's demonstration isn't the episode's.
+    """
+    if path.is_dir():
+        raise BrokenFile(f"{path}: is a directory; {_inside(path)}")
+    if path.suffix == ".json":
+        raise BrokenFile(f"{path}: holds no recording; pass a demonstration's or an episode's .h5")
+    recording = load_recording(path)
+    if isinstance(recording, Demonstration):
+        return Playback(path.name, recording)
+    beside = path.resolve().parent.parent / "demo.h5"
+    if not beside.exists():
+        raise MissingFile(
+            f"{path}: an episode needs the demonstration it was made from, {beside} isn't there; "
+            "play it inside its dataset directory"
+        )
+    demonstration = load_demonstration(beside)
+    if demonstration.content_hash() != recording.provenance.demonstration_hash:
+        raise Mismatch(f"{path}: was made from another demonstration than {beside}; put it back")
+    return Playback(path.name, demonstration, recording)
+
+
+def _inside(path: Path) -> str:
+    episodes = sorted((path / "episodes").glob("*.h5"))
+    if episodes:
+        return f"name one of its {len(episodes)} episodes, such as {episodes[0]}"
+    if (path / "demo.h5").exists():
+        return f"its demonstration is {path / 'demo.h5'}"
+    return "expected a demonstration's or an episode's .h5"
+
+
+def check_play_options(args: Play) -> None:
+    """Refuse what can't be done before anything is drawn.
+
+    Raises:
+        InvalidInput: the speed is not positive, or the film's name doesn't end in .mp4.
+        OutputExists, CannotWrite: the film can't be written.
+    """
+    check_positive("speed", args.speed)
+    if args.out is not None:
+        if args.out.suffix.lower() != ".mp4":
+            raise InvalidInput(f"{args.out}: expected a file name that ends in .mp4")
+        check_writable(args.out, args.overwrite)
+
+
+def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, Any]:
+    """What was played: in a window until it was closed, or into a film."""
+    said = {
+        "played": str(args.file),
+        "kind": "episode" if playback.split else "demonstration",
+        "task": playback.demonstration.task,
+        "steps": len(playback),
+        "seconds": playback.seconds,
+    }
+    if args.out is None:
+        with Screen(f"sart play {playback.title}") as screen:
+            PlayWindow(playback, scene, screen, args.speed).run()
+        return said
+    with progress_bar("play", len(playback), "picture") as bar:
+
+        def counted() -> Any:
+            for frame in film(playback, scene):
+                yield frame
+                bar.update(1)
+
+        write_video(args.out, counted(), RECORD_HZ * args.speed)
+    return said | {"film": str(args.out)}

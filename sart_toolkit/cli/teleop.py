@@ -1,0 +1,101 @@
+"""Recording by a person's hand, for `sart record`: the window, and where the result goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sart_toolkit.backends.interface import Backend
+from sart_toolkit.cli.arguments import Record
+from sart_toolkit.cli.console import say
+from sart_toolkit.errors import Discarded, InvalidInput, MissingCapability, NoDisplay
+from sart_toolkit.motion.controller import ControllerConfig
+from sart_toolkit.records import CONTROL_HZ, Demonstration
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.storage import append_json_line, check_writable, remove, save_demonstration
+from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.teach.desk import RecordingDesk
+from sart_toolkit.teach.devices.manual import ManualDevice
+from sart_toolkit.teach.screen import Screen, start_sdl
+from sart_toolkit.teach.session import SessionConfig, TeleopSession
+from sart_toolkit.teach.window import RecordingWindow
+
+
+def record_by_hand(
+    args: Record,
+    backend: Backend,
+    task: Task,
+    model: RobotModel,
+    device: ManualDevice,
+    placement: Placement,
+) -> Demonstration:
+    """The demonstration that a person steered and saved at `args.out`.
+
+    Raises:
+        Discarded: the person threw it away.
+        MissingCapability: the backend draws no pictures.
+        DeviceLost: there is nothing to steer with.
+        NoDisplay: no window can be opened.
+        MissingExtra: a library isn't installed.
+    """
+
+    def save(demonstration: Demonstration) -> None:
+        check_writable(args.out, args.overwrite)
+        save_demonstration(args.out, demonstration)
+
+    def watch(status: Mapping[str, Any]) -> None:
+        if args.status is not None:
+            append_json_line(args.status, status)
+
+    if not backend.capabilities.renders:
+        raise MissingCapability(
+            f"backend {backend.name!r} draws no pictures to steer by; use another backend"
+        )
+    if args.status is not None:
+        check_writable(args.status, args.overwrite)
+        remove(args.status)
+    desk: RecordingDesk | None = None
+    try:
+        start_sdl()
+        device.connect()
+        robot = backend.robot
+        # No joint goes faster than it can, so nothing jumps near the edge of what can be reached.
+        slowest = float(np.min(robot.velocity_limits)) / CONTROL_HZ
+        config = SessionConfig(
+            cameras=(robot.wrist_camera.name,),
+            max_seconds=args.max_seconds,
+            end_on_success=True,
+            controller=ControllerConfig(max_joint_step=slowest),
+        )
+        session = TeleopSession(backend, task, model, placement, config)
+        desk = RecordingDesk(session, device, save, watch)
+        with Screen(f"sart record {task.name}") as screen:
+            RecordingWindow(desk, screen, str(args.out)).run()
+    except KeyboardInterrupt:
+        if desk is None or desk.demonstration is None:
+            say("sart: the recording was cut off, nothing was written")
+        raise
+    except NoDisplay as error:
+        raise NoDisplay(f"{error}; or let a script steer: --device scripted") from error
+    finally:
+        device.close()
+    if desk.demonstration is None:
+        raise Discarded("the recording was discarded, nothing was written; record again")
+    return desk.demonstration
+
+
+def check_hand_options(args: Record, interactive: bool) -> None:
+    """Refuse options that mean nothing to a script.
+
+    Raises:
+        InvalidInput: one was given.
+    """
+    if interactive:
+        return
+    for name in ("frame", "operator", "status"):
+        if getattr(args, name) is not None:
+            raise InvalidInput(
+                f"--{name}: is for a device that a person holds; add --device keyboard, say"
+            )

@@ -1,0 +1,44 @@
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from sart_toolkit.storage import load_demonstration
+from sart_toolkit.testing.desktop import check_desktop
+
+_PATH = Path(__file__).parents[2] / "tools" / "human_path.py"
+_SPEC = importlib.util.spec_from_file_location("human_path", _PATH)
+assert _SPEC is not None and _SPEC.loader is not None
+human_path = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(human_path)
+
+
+@pytest.mark.window
+def test_a_demonstration_is_recorded_by_keys_alone_in_the_real_window(tmp_path, capsys):
+    check_desktop()
+    pytest.importorskip("pygame")
+    assert human_path.main([str(tmp_path), "--stages", "record"]) == 0
+    assert "record " in capsys.readouterr().out
+    shown = load_demonstration(tmp_path / "demo.h5")
+    assert shown.success[-10:].all() and shown.device == "keyboard"
+    assert shown.operator == "machine hands"
+    assert shown.seconds >= shown.timestamps[-1] * 0.9
+    for phase in ("ready", "recording", "ended", "saved"):
+        with Image.open(tmp_path / "pictures" / f"record_{phase}.png") as picture:
+            assert picture.size == (1280, 800)
+    rows = [json.loads(line) for line in (tmp_path / "status.jsonl").read_text().splitlines()]
+    assert [rows[0]["phase"], rows[-1]["phase"]] == ["ready", "saved"]
+
+
+def test_an_unknown_task_is_one_line_and_exit_code_2(tmp_path, capsys):
+    assert human_path.main([str(tmp_path), "--task", "peg"]) == 2
+    out, err = capsys.readouterr()
+    assert not out and "unknown task 'peg'" in err and len(err.splitlines()) == 1
+
+
+def test_an_unknown_stage_is_one_line_and_exit_code_2(tmp_path, capsys):
+    assert human_path.main([str(tmp_path), "--stages", "recrod"]) == 2
+    out, err = capsys.readouterr()
+    assert not out and "unknown stage 'recrod': did you mean 'record'" in err
