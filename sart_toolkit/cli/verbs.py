@@ -18,7 +18,6 @@ import numpy as np
 from sart_toolkit import doctor
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.strategies import SamplingConfig
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import BackendFactory
@@ -60,6 +59,7 @@ from sart_toolkit.learn.training import TrainConfig, train
 from sart_toolkit.records import Dataset, Demonstration, library_versions
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.sampling import SamplingConfig
 from sart_toolkit.scene.appearance import vary_appearance
 from sart_toolkit.scene.cloud import CloudConfig
 from sart_toolkit.scene.demonstrated import DemonstratedScene

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.segments import KEPT, SegmentMaker, SegmentPlanner
-from sart_toolkit.augment.strategies import sample_direction, sample_rotation
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.errors import InvalidInput, Mismatch, MotionRejected, Unreachable
 from sart_toolkit.evaluate.benchmark import Cell
@@ -34,6 +33,7 @@ from sart_toolkit.records import (
 )
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.sampling import sample_direction, sample_rotation
 from sart_toolkit.scene.collision import PlacedModel, coal_transform, convex_distance
 from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.scene.spec import SceneSpec
