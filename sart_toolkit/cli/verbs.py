@@ -21,7 +21,14 @@ from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import BackendFactory
+from sart_toolkit.cli.annotate import (
+    annotate_verb,
+    describe_spheres,
+    suggest_config,
+    surroundings_of,
+)
 from sart_toolkit.cli.arguments import (
+    Annotate,
     Augment,
     BenchmarkCloud,
     BenchmarkOperator,
@@ -61,8 +68,6 @@ from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.sampling import SamplingConfig
 from sart_toolkit.scene.appearance import vary_appearance
-from sart_toolkit.scene.cloud import CloudConfig
-from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.storage import (
     check_writable,
     clear_directory,
@@ -78,15 +83,9 @@ from sart_toolkit.storage import (
 )
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
-from sart_toolkit.teach.cloud import CloudSurroundings
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import (
-    ExactSurroundings,
-    SuggestConfig,
-    Surroundings,
-    suggest_annotation,
-)
+from sart_toolkit.teach.suggest import suggest_annotation
 from sart_toolkit.testing.closest import ClosestPoints
 
 Result = dict[str, Any]
@@ -149,19 +148,9 @@ def record_verb(args: Record) -> Result:
 def suggest_verb(args: Suggest) -> Result:
     """`sart suggest`."""
     demonstration = load_demonstration(args.demo)
-    task = get_task(demonstration.task)
-    config = SuggestConfig(
-        margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius
-    )
+    config = suggest_config(args)
     check_writable(args.out, args.overwrite)
-    robot = get_robot(demonstration.robot)
-    surroundings: Surroundings
-    if args.source == "cloud":
-        cloud = CloudConfig(unknown=args.unknown)
-        surroundings = CloudSurroundings(demonstration, robot, task.scene, cloud, args.grasp_play)
-    else:
-        scene = DemonstratedScene(demonstration, robot, task.scene, args.grasp_play)
-        surroundings = ExactSurroundings(scene)
+    surroundings = surroundings_of(args, demonstration)
     with progress_bar("suggest", len(demonstration), "waypoint") as bar:
         annotation = suggest_annotation(
             demonstration,
@@ -172,17 +161,7 @@ def suggest_verb(args: Suggest) -> Result:
         )
         bar.update(len(demonstration) - bar.n)
     save_annotation(args.out, annotation)
-    return {
-        "annotation": str(args.out),
-        "spheres": [
-            {
-                "waypoint": sphere.waypoint,
-                "radius_mm": round(sphere.radius * 1e3, 2),
-                "limited_by": sphere.limited_by,
-            }
-            for sphere in annotation.spheres
-        ],
-    }
+    return {"annotation": str(args.out), "spheres": describe_spheres(annotation)}
 
 
 def augment_verb(args: Augment) -> Result:
@@ -627,6 +606,7 @@ _VERBS: dict[type, Callable[[Any], Result]] = {
     Run: run_whole,
     Record: record_verb,
     Suggest: suggest_verb,
+    Annotate: annotate_verb,
     Augment: augment_verb,
     Validate: validate_verb,
     Train: train_verb,
