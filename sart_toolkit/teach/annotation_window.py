@@ -25,7 +25,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scene.cloud import CloudConfig, SceneCloud, fuse_cloud
 from sart_toolkit.scene.spec import SceneSpec
-from sart_toolkit.scene.visuals import DrawnRobot, body_meshes
+from sart_toolkit.scene.visuals import DrawnMesh, DrawnRobot, body_meshes
 from sart_toolkit.teach.annotation import ACTIONS, AnnotationSession, Word
 
 try:
@@ -57,6 +57,7 @@ _PATH_COLOURS = np.array([_COLOURS[word] for word in ("colliding", "tight", "saf
 _TRIAD_COLOURS = np.eye(3) * 0.75 + 0.1
 # From what is looked at to the eye at the start, and to the right as seen from there.
 _TOWARDS_EYE = np.array([0.55, -0.76, 0.35])
+_TOWARDS_LIGHT = np.array([0.48, -0.40, 0.78])
 _RIGHT = np.array([0.81, 0.59, 0.0])
 # Spheres listed, columns of keys.
 _ROWS, _KEY_COLUMNS = 10, 4
@@ -145,8 +146,9 @@ class AnnotationWindow:
         self._view = gui.SceneWidget()
         self._view.scene = rendering.Open3DScene(self._window.renderer)
         self._view.scene.set_background([*_BACKDROP, 1.0])
-        # Colours as they are, and half the time on a CPU.
+        # Colours as they are, and a fraction of the time on a CPU.
         self._view.scene.view.set_post_processing(False)
+        self._view.scene.view.set_sample_count(1)
         lights = self._view.scene.scene
         lights.set_sun_light([-0.5, 0.6, -0.6], [1.0, 1.0, 1.0], 80_000)
         lights.enable_sun_light(True)
@@ -205,6 +207,7 @@ class AnnotationWindow:
         if self._moving and waited > self._config.idle_s:
             self._moving = False
             self._show_surroundings()
+            self._draw_governing()
             self._window.post_redraw()
         elif not self._moving:
             self._session.prepare()
@@ -218,22 +221,26 @@ class AnnotationWindow:
             order = np.random.default_rng(0).permutation(len(cloud))
             n = self._config.moving_points
             for name, rows, size in (("whole", order, 2), ("thin", order[:n], 4)):
-                add(name, _point_cloud(cloud, rows), _point_material(size))
+                add(name, _point_cloud(cloud, rows), _plain(size))
                 self._clouds.append(name)
         self._bodies: list[tuple[str, str]] = []
         for body in self._scene.bodies:
             if body.name in self._session.demonstration.body_Ts_world:
+                T = self._session.demonstration.body_Ts_world[body.name][0]
                 for i, mesh in enumerate(body_meshes(body)):
                     name = f"body {body.name} {i}"
-                    add(name, _mesh(mesh.vertices, mesh.triangles), _material(mesh.rgba[:3]))
+                    add(name, _shaded(mesh, T), _plain())
                     self._bodies.append((name, body.name))
-        for i, mesh in enumerate(self._robot.meshes):
-            add(f"robot {i}", _mesh(mesh.vertices, mesh.triangles), _material(mesh.rgba[:3]))
+        steps = self._session.demonstration.steps
+        gripper = float(np.clip(steps.measured_gripper[0], 0.0, 1.0))
+        Ts_part = self._robot.poses(steps.joint_positions[0], gripper)
+        for i, (mesh, T) in enumerate(zip(self._robot.meshes, Ts_part, strict=True)):
+            add(f"robot {i}", _shaded(mesh, T), _plain())
         Ts = self._session.demonstration.steps.measured_Ts_world_tool
         add("path", _path(Ts[:, :3, 3], self._session.clearances), _line_material(5))
         add("triads", _triads(Ts, 0.008), _line_material(1.5))
         add("triad", _triads(np.eye(4)[None], 0.05), _line_material(4))
-        add("convergence", _ball(0.004, _ACCENT), _material((1, 1, 1)))
+        add("convergence", _ball(0.004, _ACCENT), _plain())
 
     def _update(self) -> None:
         """Draw what the session says now."""
@@ -274,13 +281,15 @@ class AnnotationWindow:
                 scene.show_geometry(rings, False)
                 continue
             sphere = session.spheres[i]
-            look = session.verdict(sphere).word, sphere is session.sphere
+            # Glass is dear on a CPU: only the sphere at hand is made of it.
+            look = session.verdict(sphere).word, sphere is session.governing
             if self._looks.get(i) != look:
-                colour, here = _COLOURS[look[0]], look[1]
+                colour, glass = _COLOURS[look[0]], look[1]
                 for name in (ball, rings):
                     scene.remove_geometry(name)
-                scene.add_geometry(ball, _ball(1.0, colour), _glass(0.45 if here else 0.2))
-                scene.add_geometry(rings, _rings(colour), _line_material(2.5 if here else 1.0))
+                if glass:
+                    scene.add_geometry(ball, _ball(1.0, colour), _glass(0.45))
+                scene.add_geometry(rings, _rings(colour), _line_material(2.5 if glass else 1.5))
                 self._looks[i] = look
             T = np.diag([*[sphere.radius] * 3, 1.0])
             T[:3, 3] = sphere.T_world_key[:3, 3]
@@ -296,15 +305,15 @@ class AnnotationWindow:
         self._labels = []
         sphere, positions = session.governing, session.demonstration.steps.measured_Ts_world_tool
         scene.show_geometry("convergence", sphere is not None)
-        n = session.config.ghosts
         here = session.sphere
         if here is not None:
-            self._draw_ghosts(here)
             beside = (here.radius + 0.01) * _RIGHT
             self._label(here.T_world_key[:3, 3] + beside, f"{1e3 * here.radius:.1f} mm", _INK)
-        for i in range(n):
+        for i in range(session.config.ghosts):
             if scene.has_geometry(f"ghost {i}"):
-                scene.show_geometry(f"ghost {i}", here is not None)
+                scene.show_geometry(f"ghost {i}", False)
+        if here is not None and not self._moving:
+            self._draw_ghosts(here)
         if sphere is not None:
             t_star = session.convergence(sphere)
             T = np.eye(4)
@@ -327,13 +336,14 @@ class AnnotationWindow:
             Ts = self._robot.poses(q, gripper)
             for i in self._robot.tool:
                 mesh = self._robot.meshes[i]
-                tool += _mesh(mesh.vertices, mesh.triangles).transform(T_tool_world @ Ts[i])
+                tool += _shaded(mesh, Ts[i]).transform(T_tool_world @ Ts[i])
             tool.paint_uniform_color(_FAINT)
             for i in range(self._session.config.ghosts):
                 scene.remove_geometry(f"ghost {i}")
                 scene.add_geometry(f"ghost {i}", tool, _glass(0.25))
             self._ghost_gripper = gripper
         for i, T in enumerate(self._session.ghosts(sphere)):
+            scene.show_geometry(f"ghost {i}", True)
             scene.set_geometry_transform(f"ghost {i}", T)
 
     # --- camera and layout ----------------------------------------------------------------------
@@ -470,14 +480,6 @@ def _picture(rgb: Image, size: int) -> Any:
     return open3d.geometry.Image(pixels)
 
 
-def _material(colour: Sequence[float]) -> Any:
-    material = rendering.MaterialRecord()
-    material.shader = "defaultLit"
-    material.base_color = [*colour, 1.0]
-    material.base_roughness = 0.8
-    return material
-
-
 def _glass(alpha: float) -> Any:
     """For meshes with colours of their own."""
     material = rendering.MaterialRecord()
@@ -494,22 +496,32 @@ def _line_material(width: float) -> Any:
     return material
 
 
-def _point_material(size: float) -> Any:
+def _plain(point_size: float = 1.0) -> Any:
+    """For colours as they are, of meshes and of points."""
     material = rendering.MaterialRecord()
-    # The one unlit shader without a texture, see `_mesh`.
+    # The one such shader that reads no texture, see `_textured`; "defaultUnlit" does.
     material.shader = "unlitPolygonOffset"
-    material.point_size = size
+    material.point_size = point_size
     return material
 
 
-def _mesh(corners: Array, triangles: NDArray[np.int64]) -> Any:
-    """A mesh whose triangles are flat."""
-    corners = corners[triangles].reshape(-1, 3)
+def _shaded(mesh: DrawnMesh, T_world_mesh: Array) -> Any:
+    """A mesh of flat triangles, its light drawn on once, where it stands at `T_world_mesh`.
+
+    A light that is computed for every picture takes a CPU twice as long as all the rest.
+    """
+    corners = mesh.vertices[mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    towards_light = T_world_mesh[:3, :3].T @ _TOWARDS_LIGHT
+    bright = 0.72 + 0.28 * normals @ towards_light
     made = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(corners),
-        open3d.utility.Vector3iVector(np.arange(len(corners), dtype=np.int32).reshape(-1, 3)),
+        open3d.utility.Vector3dVector(corners.reshape(-1, 3)),
+        open3d.utility.Vector3iVector(np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)),
     )
-    made.compute_vertex_normals()
+    colours = np.repeat(bright[:, None] * np.array(mesh.rgba[:3]), 3, axis=0)
+    made.vertex_colors = open3d.utility.Vector3dVector(colours)
+    made.vertex_normals = open3d.utility.Vector3dVector(np.repeat(normals, 3, axis=0))
     return _textured(made)
 
 
