@@ -59,6 +59,8 @@ _TRIAD_COLOURS = np.eye(3) * 0.75 + 0.1
 _TOWARDS_EYE = np.array([0.55, -0.76, 0.35])
 _TOWARDS_LIGHT = np.array([0.48, -0.40, 0.78])
 _RIGHT = np.array([0.81, 0.59, 0.0])
+# Two requests to close the window within so many seconds are one.
+_ONE_PRESS = 0.3
 # Spheres listed, columns of keys.
 _ROWS, _KEY_COLUMNS = 10, 4
 
@@ -154,7 +156,7 @@ class AnnotationWindow:
         lights.enable_sun_light(True)
         lights.set_indirect_light_intensity(60_000)
         self._moving = False
-        self._last_key = 0.0
+        self._last_key = self._last_close = 0.0
         self._resets = session.view_resets
         self._looks: dict[int, tuple[Word, bool]] = {}
         self._ghost_gripper: float | None = None
@@ -184,10 +186,8 @@ class AnnotationWindow:
     # --- keys -----------------------------------------------------------------------------------
 
     def _on_key(self, event: Any) -> bool:
-        if event.type != gui.KeyEvent.Type.DOWN:
-            return False
         key = _KEY_NAMES.get(int(event.key))
-        if key is None:
+        if key is None or event.type != gui.KeyEvent.Type.DOWN:
             return False
         self._moving, self._last_key = True, time.monotonic()
         self._session.press(key)
@@ -197,9 +197,11 @@ class AnnotationWindow:
         return True
 
     def _on_close(self) -> bool:
-        if not self._session.done:
+        # Open3D closes the window on Escape, when it goes down and when it comes up: asked once.
+        if not self._session.done and time.monotonic() - self._last_close > _ONE_PRESS:
             self._session.perform("quit")
             self._update()
+        self._last_close = time.monotonic()
         return self._session.done
 
     def _idle(self) -> None:
@@ -458,6 +460,8 @@ def _key_names() -> dict[int, str]:
         for key in action.keys:
             for name in names.get(key, (key.upper().replace(" ", "_"),)):
                 found[int(getattr(gui.KeyName, name))] = key
+    # It closes the window, which asks to quit as well.
+    del found[int(gui.KeyName.ESCAPE)]
     return found
 
 

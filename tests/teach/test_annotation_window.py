@@ -11,7 +11,7 @@ import pytest
 
 from sart_toolkit.errors import InvalidInput, MissingExtra
 from sart_toolkit.storage import load_annotation, save_demonstration
-from sart_toolkit.teach.annotation import ACTIONS, KEYS
+from sart_toolkit.teach.annotation import KEYS
 from sart_toolkit.testing.desktop import Desktop, check_desktop
 
 SART = [sys.executable, "-c", "from sart_toolkit.cli import main; main()", "annotate"]
@@ -104,8 +104,8 @@ def test_ctrl_c_closes_the_window_and_keeps_the_work(
 
 
 def test_every_key_has_a_number_of_open3d(window_module):
-    assert set(window_module._KEY_NAMES.values()) == set(KEYS)
-    assert len(window_module._KEY_NAMES) == sum(len(a.keys) for a in ACTIONS.values()) + 2
+    # Escape closes the window, which is asked first like every closing.
+    assert set(window_module._KEY_NAMES.values()) == set(KEYS) - {"Escape"}
 
 
 def test_without_open3d_the_remedy_is_told(monkeypatch):
