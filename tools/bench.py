@@ -564,7 +564,8 @@ _KEYS = (
     "Right", "Enter", "Up", "+", "-", "Down", "M", "C", "Enter", "+", "F", "N", "P", "Left", "S",
     "Right", "Right", "Page Down", "Enter", "Backspace", "Z", "Y", "Page Up", "Right", "Home",
 )  # fmt: skip
-_X_NAMES = {"Enter": "Return", "Backspace": "BackSpace", "+": "plus", "-": "minus",
+# "+" by the key beside it, which means the same there: xdotool takes half a second for a shift.
+_X_NAMES = {"Enter": "Return", "Backspace": "BackSpace", "+": "equal", "-": "minus",
             "Page Down": "Page_Down", "Page Up": "Page_Up"}  # fmt: skip
 
 

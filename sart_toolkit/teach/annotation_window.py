@@ -75,7 +75,7 @@ class WindowConfig:
 
     width: int = 1280
     height: int = 800
-    moving_points: int = 10_000
+    moving_points: int = 6_000
     idle_s: float = 0.5
 
     def __post_init__(self) -> None:
