@@ -476,9 +476,18 @@ def benchmark_cloud_verb(args: BenchmarkCloud) -> Result:
     write_json(args.out, _about() | result)
     return {"benchmark": str(args.out)} | {
         name: f"{row['median_share']:.0%} of the exact radii at the median, at most "
-        f"{row['largest_excess_mm']:+.1f} mm larger"
+        f"{row['largest_excess_mm']:+.1f} mm larger{_surface_line(row.get('surface_errors'))}"
         for name, row in [*result["cells"].items(), ("all", result["total"])]
     }
+
+
+def _surface_line(errors: Result | None) -> str:
+    if errors is None:
+        return ""
+    return (
+        f"; {errors['points']} points, {errors['median_mm']:.2f} mm off the true surfaces at the "
+        f"median, {errors['p95_mm']:.2f} at the 95th percentile, {errors['on_robot']} on the robot"
+    )
 
 
 def _about() -> Result:

@@ -149,8 +149,12 @@ class AnnotationWindow:
         self._view.scene = rendering.Open3DScene(self._window.renderer)
         self._view.scene.set_background([*_BACKDROP, 1.0])
         # Colours as they are, and a fraction of the time on a CPU.
-        self._view.scene.view.set_post_processing(False)
-        self._view.scene.view.set_sample_count(1)
+        drawing = self._view.scene.view
+        drawing.set_post_processing(False)
+        drawing.set_sample_count(1)
+        drawing.set_ambient_occlusion(False)
+        drawing.set_antialiasing(False)
+        drawing.set_shadowing(False, drawing.ShadowType.PCF)
         lights = self._view.scene.scene
         lights.set_sun_light([-0.5, 0.6, -0.6], [1.0, 1.0, 1.0], 80_000)
         lights.enable_sun_light(True)
