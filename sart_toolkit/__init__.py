@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.engine import augment_demonstration
-    from sart_toolkit.augment.strategies import SamplingConfig
     from sart_toolkit.augment.validate import validate_dataset
     from sart_toolkit.backends import make_backend
     from sart_toolkit.evaluate.report import write_report
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from sart_toolkit.learn.training import TrainConfig, train
     from sart_toolkit.robots import get_robot
     from sart_toolkit.robots.model import RobotModel
+    from sart_toolkit.sampling import SamplingConfig
     from sart_toolkit.scene.appearance import vary_appearance
     from sart_toolkit.scene.certificate import certify
     from sart_toolkit.scene.collision import CollisionModel
@@ -46,7 +46,7 @@ _HOMES = {
     "ExactSurroundings": "teach.suggest",
     "Placement": "tasks.task",
     "RobotModel": "robots.model",
-    "SamplingConfig": "augment.strategies",
+    "SamplingConfig": "sampling",
     "ScriptedOperator": "teach.scripted",
     "SuggestConfig": "teach.suggest",
     "TrainConfig": "learn.training",

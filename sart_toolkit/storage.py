@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import fcntl
 import io
 import json
 import os
@@ -155,6 +156,70 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
             with contextlib.suppress(ValueError):
                 rows.append(json.loads(line))
     return [row for row in rows if isinstance(row, dict)]
+
+
+class Journal:
+    """Rows appended to a file of lines, each on the disk when `append` returns.
+
+    One process at a time has it. A row that a crash cut short is dropped when it is opened again.
+
+    Attributes:
+        path: the file.
+        rows: what it holds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a journal, made if needed.
+
+        Raises:
+            CannotWrite: the disk refuses, or another process has it open.
+        """
+        self.path = Path(path)
+        with _cannot_write(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self.path, "ab+")  # noqa: SIM115 - open until `close`
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self._file.close()
+            raise CannotWrite(
+                f"{self.path}: another process is at work on it; end that one first, or choose "
+                "another --out"
+            ) from error
+        self._file.seek(0)
+        content = self._file.read()
+        self._file.truncate(content.rfind(b"\n") + 1)
+        self.rows = read_json_lines(self.path)
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Add one row.
+
+        Raises:
+            CannotWrite: the disk refuses.
+        """
+        with _cannot_write(self.path):
+            end = self._file.seek(0, os.SEEK_END)
+            try:
+                self._file.write(json.dumps(row, allow_nan=False).encode() + b"\n")
+                self._file.flush()
+                os.fsync(self._file.fileno())
+            except OSError:
+                # What the disk has no room for must not stand before the next row.
+                with contextlib.suppress(OSError):
+                    os.ftruncate(self._file.fileno(), end)
+                raise
+        self.rows.append(dict(row))
+
+    def clear(self) -> None:
+        """Drop all rows."""
+        self._file.truncate(0)
+        self.rows = []
+
+    def close(self, remove: bool = False) -> None:
+        """Let go of the file; with `remove`, remove it too."""
+        if remove and not self._file.closed:
+            self.path.unlink(missing_ok=True)
+        self._file.close()
 
 
 def check_writable(path: Path, overwrite: bool = False) -> None:

@@ -17,6 +17,7 @@ LAYERS = (
     "tables",
     "workers",
     "records",
+    "sampling",
     "storage",
     "robots",
     "scene",

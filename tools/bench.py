@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import importlib.metadata
 import json
 import statistics
 import sys
@@ -16,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.errors import MotionRejected, SartError, Unreachable, unknown_name
+from sart_toolkit.errors import InvalidInput, MotionRejected, SartError, Unreachable, unknown_name
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.learn.training import (
     TrainConfig,
@@ -56,16 +57,23 @@ from sart_toolkit.records import (
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scene.certificate import certify
+from sart_toolkit.scene.cloud import fuse_cloud
 from sart_toolkit.scene.collision import CollisionModel, PlacedModel
 from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.storage import load_demonstration, save_demonstration
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.teach.annotation import AnnotationSession
 from sart_toolkit.teach.scripted import ScriptedOperator
 from sart_toolkit.teach.session import record_demonstration
 from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.testing.closest import ClosestPoints
 from sart_toolkit.testing.clutter import CLUTTER, Segment, random_segment
+from sart_toolkit.testing.desktop import Desktop
+
+if TYPE_CHECKING:
+    from sart_toolkit.teach.annotation_window import WindowConfig
 
 _DEMONSTRATION_STEPS = 60
 _SEGMENT_STEPS = 20
@@ -549,9 +557,150 @@ def _drive(backend: Backend, task: Task, seed: int) -> tuple[float, float]:
         physics.append(time.perf_counter() - started)
 
 
+# --- the annotator ------------------------------------------------------------------------------
+
+# As a person would go: step, add, try radii, jump on, suggest, remove, undo.
+_KEYS = (
+    "Right", "Enter", "Up", "+", "-", "Down", "M", "C", "Enter", "+", "F", "N", "P", "Left", "S",
+    "Right", "Right", "Page Down", "Enter", "Backspace", "Z", "Y", "Page Up", "Right", "Home",
+)  # fmt: skip
+# "+" by the key beside it, which means the same there: xdotool takes half a second for a shift.
+_X_NAMES = {"Enter": "Return", "Backspace": "BackSpace", "+": "equal", "-": "minus",
+            "Page Down": "Page_Down", "Page Up": "Page_Up"}  # fmt: skip
+
+
+def bench_annotate(arguments: Sequence[str]) -> dict[str, Any]:
+    """Milliseconds from a key to what it changes, in the annotator's window and session.
+
+    `picture`: from xdotool's start to the first picture of the screen that differs, at 1280 x 800
+    on a screen of its own; each key once all has come to rest. `session`: what a key does, with
+    all that the window asks the session afterwards; `cold` with nothing computed ahead.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py annotate", description=bench_annotate.__doc__)
+    parser.add_argument("--points", type=int, default=200_000, help="of the cloud")
+    parser.add_argument("--repeats", type=int, default=2, help=f"of the {len(_KEYS)} keys")
+    parser.add_argument("--window", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    check_positive("--points", options.points)
+    check_positive("--repeats", options.repeats)
+    if options.window is not None:
+        _show_window(options.window, options.points)
+        return {}
+    # Open3D is an extra, which the other benchmarks do without.
+    from sart_toolkit.teach.annotation_window import WindowConfig
+
+    task = get_task("peg_in_hole")
+    robot = get_robot(task.robot)
+    model = RobotModel(robot, task.scene.held)
+    plan = task.plan(task.initial_state(model, Placement()))
+    operator = ScriptedOperator(plan, np.random.default_rng(0))
+    backend = make_backend("pybullet", robot, task.scene, 128)
+    demonstration = record_demonstration(backend, task, model, operator)
+    backend.close()
+    scene = DemonstratedScene(demonstration, robot, task.scene)
+    keys = _KEYS * options.repeats
+    cold = _session_ms(_session(demonstration, scene), keys)
+    session = _session(demonstration, scene)
+    while session.prepare():
+        pass
+    with tempfile.TemporaryDirectory() as scratch:
+        save_demonstration(Path(scratch) / "demo.h5", demonstration)
+        pictures = _picture_ms(Path(scratch), options.points, keys, WindowConfig())
+    return {
+        "picture_ms": _spread(pictures),
+        "session_ms": _spread(_session_ms(session, keys)),
+        "session_cold_ms": _spread(cold),
+        "points": options.points,
+        "points_while_moving": WindowConfig().moving_points,
+        "keys": len(keys),
+        "open3d": importlib.metadata.version("open3d-cpu"),
+    }
+
+
+def _session(demonstration: Demonstration, scene: DemonstratedScene) -> AnnotationSession:
+    session = AnnotationSession(demonstration, ExactSurroundings(scene))
+    _ = session.clearances
+    return session
+
+
+def _session_ms(session: AnnotationSession, keys: Sequence[str]) -> list[float]:
+    """For each key the time of what it does and of all that is shown afterwards."""
+    figures = []
+    for key in keys:
+        started = time.perf_counter()
+        session.press(key)
+        session.state()
+        for sphere in session.spheres:
+            session.verdict(sphere)
+        if session.sphere is not None:
+            session.ghosts(session.sphere)
+        figures.append(1e3 * (time.perf_counter() - started))
+    return figures
+
+
+def _picture_ms(
+    folder: Path, points: int, keys: Sequence[str], config: WindowConfig
+) -> list[float]:
+    """For each key the time until the screen shows another picture."""
+    figures = []
+    with Desktop(config.width, config.height) as screen:
+        program = [sys.executable, __file__, "annotate", "--window", str(folder)]
+        screen.start([*program, "--points", str(points)])
+        screen.window("sart annotate")
+        for n, key in enumerate(keys, 1):
+            before = _at_rest(screen, 3 * config.idle_s)
+            started = time.perf_counter()
+            screen.key(_X_NAMES.get(key, key if len(key) > 1 else key.lower()))
+            while screen.screenshot().tobytes() == before:
+                if time.perf_counter() - started > 10.0:
+                    raise InvalidInput(f"{key}: changed nothing on the screen within 10 s")
+                # Looking all the time would take the renderer's time.
+                time.sleep(0.01)
+            figures.append(1e3 * (time.perf_counter() - started))
+            _say(f"key {n}/{len(keys)}: {key} {figures[-1]:.0f} ms")
+    return figures
+
+
+def _at_rest(screen: Desktop, seconds: float) -> bytes:
+    """The screen once nothing has changed on it for so long."""
+    picture, since = screen.screenshot().tobytes(), time.perf_counter()
+    while time.perf_counter() - since < seconds:
+        time.sleep(0.1)
+        now = screen.screenshot().tobytes()
+        if now != picture:
+            picture, since = now, time.perf_counter()
+    return picture
+
+
+def _show_window(folder: Path, points: int) -> None:
+    """The annotator with so many points: those of the pictures, several times with some noise."""
+    from sart_toolkit.teach.annotation_window import annotate_in_window
+
+    demonstration = load_demonstration(folder / "demo.h5")
+    task, robot = get_task(demonstration.task), get_robot(demonstration.robot)
+    session = _session(demonstration, DemonstratedScene(demonstration, robot, task.scene))
+    cloud = fuse_cloud(demonstration, robot, task.scene.held)
+    rng = np.random.default_rng(0)
+    rows = rng.integers(len(cloud), size=points)
+    noisy = cloud.points[rows] + rng.normal(0, cloud.config.voxel / 2, (points, 3))
+    many = dataclasses.replace(
+        cloud, points=noisy, colours=cloud.colours[rows], behind=cloud.behind[rows]
+    )
+    annotate_in_window(session, robot, task.scene, many)
+
+
+def _spread(milliseconds: Sequence[float]) -> dict[str, float]:
+    return {
+        "median": statistics.median(milliseconds),
+        "p95": float(np.percentile(milliseconds, 95)),
+        "max": max(milliseconds),
+    }
+
+
 # --- the table, the machine ---------------------------------------------------------------------
 
 BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
+    "annotate": bench_annotate,
     "augment": bench_augment,
     "certificate": bench_certificate,
     "step": bench_step,

@@ -11,7 +11,6 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.segments import SegmentPlanner, path_deviation
-from sart_toolkit.augment.strategies import SamplingConfig
 from sart_toolkit.errors import BrokenFile, MotionRejected, SartError
 from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.motion.timing import Motion
@@ -25,6 +24,7 @@ from sart_toolkit.records import (
     apply_action,
 )
 from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.sampling import SamplingConfig
 from sart_toolkit.scene.certificate import Certificate, certify
 from sart_toolkit.scene.collision import PlacedModel
 from sart_toolkit.scene.spec import SceneSpec

@@ -33,6 +33,17 @@ _BACKENDS = Annotated[str, arg(help="Names of backends with commas between, or a
 _GRASP_PLAY = Annotated[
     float, arg(help="How far what is carried may move in the grasp [m]; so much more is kept free.")
 ]
+_SOURCE = Annotated[
+    Literal["scene", "cloud"],
+    arg(help="What is known of obstacles: the simulated scene, or the recorded RGB-D alone."),
+]
+_UNKNOWN = Annotated[
+    Literal["behind", "free"],
+    arg(help="With --source cloud: space behind what was seen counts as solid, or as free."),
+]
+_TOOL_MARGIN = Annotated[float, arg(help="Distance that stays free of the tool everywhere [m].")]
+_MIN_RADIUS = Annotated[float, arg(help="Smallest sphere worth having [m].")]
+_MAX_RADIUS = Annotated[float, arg(help="Largest sphere [m].")]
 _LAW = Annotated[
     Literal["paper", "area"],
     arg(help="How positions are drawn on a sphere: as the paper says, or uniform over its area."),
@@ -155,21 +166,49 @@ class Suggest:
     waypoints: Annotated[
         tuple[int, ...], arg(help="Key waypoints; chosen to tile the free part if left out.")
     ] = ()
-    source: Annotated[
-        Literal["scene", "cloud"],
-        arg(help="What is known of obstacles: the simulated scene, or the recorded RGB-D alone."),
-    ] = "scene"
-    unknown: Annotated[
-        Literal["behind", "free"],
-        arg(help="With --source cloud: space behind what was seen counts as solid, or as free."),
-    ] = "behind"
-    margin: Annotated[float, arg(help="Distance that stays free of the tool everywhere [m].")] = (
-        0.0005
-    )
+    source: _SOURCE = "scene"
+    unknown: _UNKNOWN = "behind"
+    margin: _TOOL_MARGIN = 0.0005
     grasp_play: _GRASP_PLAY = 0.005
-    min_radius: Annotated[float, arg(help="Smallest sphere worth having [m].")] = 0.004
-    max_radius: Annotated[float, arg(help="Largest sphere [m].")] = 0.15
+    min_radius: _MIN_RADIUS = 0.004
+    max_radius: _MAX_RADIUS = 0.15
     overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Annotate:
+    """Annotate a demonstration with precision spheres: in a window, in words, or headless.
+
+    Example: sart annotate demo.h5
+
+    Example: sart annotate demo.h5 --text
+
+    Example: sart annotate demo.h5 --suggest-all --no-window --out annotation.json
+
+    An annotation that is there is gone on with, also after an interruption.
+    """
+
+    demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
+    out: Annotated[
+        Path | None,
+        arg(help="JSON file to edit or make; DEMO's name with .annotation.json if left out."),
+    ] = None
+    text: Annotated[bool, arg(help="Without a window: type words, or pipe them in.")] = False
+    suggest_all: Annotated[bool, arg(help="Begin with all spheres suggested.")] = False
+    no_window: Annotated[bool, arg(help="Save what is suggested at once, without a window.")] = (
+        False
+    )
+    show: Annotated[
+        Literal["cloud", "scene"], arg(help="What is drawn first: recorded points, or meshes.")
+    ] = "cloud"
+    source: _SOURCE = "scene"
+    unknown: _UNKNOWN = "behind"
+    margin: _TOOL_MARGIN = 0.0005
+    grasp_play: _GRASP_PLAY = 0.005
+    min_radius: _MIN_RADIUS = 0.004
+    max_radius: _MAX_RADIUS = 0.15
+    overwrite: Annotated[bool, arg(help="Begin anew instead of going on.")] = False
     json: _JSON = False
 
 
@@ -448,6 +487,7 @@ Verb = (
     | Annotated[Record, tyro.conf.subcommand("record")]
     | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Suggest, tyro.conf.subcommand("suggest")]
+    | Annotated[Annotate, tyro.conf.subcommand("annotate")]
     | Annotated[Augment, tyro.conf.subcommand("augment")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
     | Annotated[Train, tyro.conf.subcommand("train")]

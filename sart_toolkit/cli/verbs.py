@@ -18,11 +18,17 @@ import numpy as np
 from sart_toolkit import doctor
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.strategies import SamplingConfig
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import BackendFactory
+from sart_toolkit.cli.annotate import (
+    annotate_verb,
+    describe_spheres,
+    suggest_config,
+    surroundings_of,
+)
 from sart_toolkit.cli.arguments import (
+    Annotate,
     Augment,
     BenchmarkCloud,
     BenchmarkOperator,
@@ -60,9 +66,8 @@ from sart_toolkit.learn.training import TrainConfig, train
 from sart_toolkit.records import Dataset, Demonstration, library_versions
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.sampling import SamplingConfig
 from sart_toolkit.scene.appearance import vary_appearance
-from sart_toolkit.scene.cloud import CloudConfig
-from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.storage import (
     check_writable,
     clear_directory,
@@ -78,16 +83,10 @@ from sart_toolkit.storage import (
 )
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
-from sart_toolkit.teach.cloud import CloudSurroundings
 from sart_toolkit.teach.devices import make_device
 from sart_toolkit.teach.devices.manual import ManualDevice
 from sart_toolkit.teach.session import DeviceSetup, SessionConfig, record_demonstration
-from sart_toolkit.teach.suggest import (
-    ExactSurroundings,
-    SuggestConfig,
-    Surroundings,
-    suggest_annotation,
-)
+from sart_toolkit.teach.suggest import suggest_annotation
 from sart_toolkit.testing.closest import ClosestPoints
 
 Result = dict[str, Any]
@@ -178,19 +177,9 @@ def play_verb(args: Play) -> Result:
 def suggest_verb(args: Suggest) -> Result:
     """`sart suggest`."""
     demonstration = load_demonstration(args.demo)
-    task = get_task(demonstration.task)
-    config = SuggestConfig(
-        margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius
-    )
+    config = suggest_config(args)
     check_writable(args.out, args.overwrite)
-    robot = get_robot(demonstration.robot)
-    surroundings: Surroundings
-    if args.source == "cloud":
-        cloud = CloudConfig(unknown=args.unknown)
-        surroundings = CloudSurroundings(demonstration, robot, task.scene, cloud, args.grasp_play)
-    else:
-        scene = DemonstratedScene(demonstration, robot, task.scene, args.grasp_play)
-        surroundings = ExactSurroundings(scene)
+    surroundings = surroundings_of(args, demonstration)
     with progress_bar("suggest", len(demonstration), "waypoint") as bar:
         annotation = suggest_annotation(
             demonstration,
@@ -201,17 +190,7 @@ def suggest_verb(args: Suggest) -> Result:
         )
         bar.update(len(demonstration) - bar.n)
     save_annotation(args.out, annotation)
-    return {
-        "annotation": str(args.out),
-        "spheres": [
-            {
-                "waypoint": sphere.waypoint,
-                "radius_mm": round(sphere.radius * 1e3, 2),
-                "limited_by": sphere.limited_by,
-            }
-            for sphere in annotation.spheres
-        ],
-    }
+    return {"annotation": str(args.out), "spheres": describe_spheres(annotation)}
 
 
 def augment_verb(args: Augment) -> Result:
@@ -528,9 +507,18 @@ def benchmark_cloud_verb(args: BenchmarkCloud) -> Result:
     write_json(args.out, _about() | result)
     return {"benchmark": str(args.out)} | {
         name: f"{row['median_share']:.0%} of the exact radii at the median, at most "
-        f"{row['largest_excess_mm']:+.1f} mm larger"
+        f"{row['largest_excess_mm']:+.1f} mm larger{_surface_line(row.get('surface_errors'))}"
         for name, row in [*result["cells"].items(), ("all", result["total"])]
     }
+
+
+def _surface_line(errors: Result | None) -> str:
+    if errors is None:
+        return ""
+    return (
+        f"; {errors['points']} points, {errors['median_mm']:.2f} mm off the true surfaces at the "
+        f"median, {errors['p95_mm']:.2f} at the 95th percentile, {errors['on_robot']} on the robot"
+    )
 
 
 def _about() -> Result:
@@ -658,6 +646,7 @@ _VERBS: dict[type, Callable[[Any], Result]] = {
     Record: record_verb,
     Play: play_verb,
     Suggest: suggest_verb,
+    Annotate: annotate_verb,
     Augment: augment_verb,
     Validate: validate_verb,
     Train: train_verb,

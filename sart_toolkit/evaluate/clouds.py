@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.evaluate.benchmark import Cell
-from sart_toolkit.records import library_versions
+from sart_toolkit.poses import Array
+from sart_toolkit.records import Demonstration, library_versions
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scene.cloud import fuse_cloud, surface_errors
+from sart_toolkit.scene.collision import ConvexPart
 from sart_toolkit.scene.demonstrated import DemonstratedScene
+from sart_toolkit.scene.hull import Hull
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.teach.cloud import CloudSurroundings
 from sart_toolkit.teach.scripted import ScriptedOperator
@@ -37,7 +40,8 @@ def benchmark_clouds(
 
     Spheres are where the exact suggestion has them. Also the seconds that either suggestion takes,
     the cloud's fusion included, models of robot and scene built before; and how far the cloud's
-    seen points are from the true surfaces until the first contact.
+    seen points are from the true surfaces until the first contact, and how many of them lie in
+    the robot's moving parts, or what it holds, at any waypoint until then.
 
     Args:
         cells: tasks and backends; the backends draw pictures.
@@ -59,6 +63,22 @@ def benchmark_clouds(
         "cells": rows,
         "versions": library_versions(),
     }
+
+
+def _on_robot(
+    points: Array, scene: ExactSurroundings, shown: Demonstration, waypoints: Sequence[int]
+) -> int:
+    """How many points `(n, 3)` the robot or what it holds covers at one of the waypoints."""
+    covered = np.zeros(len(points), dtype=bool)
+    hulls: dict[ConvexPart, Hull] = {}
+    for t in waypoints:
+        placed = scene.placed(t)
+        Ts = placed.joint_poses(shown.steps.joint_positions[t])
+        for part in placed.parts:
+            if part.joint > 0:
+                T, hull = Ts[part.joint], hulls.setdefault(part, Hull(part.points))
+                covered |= hull.near((points - T[:3, 3]) @ T[:3, :3], 0.0)
+    return int(covered.sum())
 
 
 def _compared(cell: Cell, seed: int) -> dict[str, Any]:
@@ -108,6 +128,7 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
             "median_mm": float(np.median(distances)),
             "p95_mm": float(np.percentile(distances, 95)),
             "max_mm": float(distances.max()),
+            "on_robot": _on_robot(seen.points, exact, shown, range(still)),
         }
     return {
         "waypoints": len(shown),

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sart_toolkit.augment.strategies import sample_direction, sample_rotation
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.benchmark import Cell
 from sart_toolkit.evaluate.running import ResultLog, check_counts, recorded
@@ -24,6 +23,7 @@ from sart_toolkit.records import (
     library_versions,
 )
 from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.sampling import sample_direction, sample_rotation
 from sart_toolkit.scene.collision import PlacedModel, coal_transform, convex_distance
 from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.scene.spec import SceneSpec

@@ -18,7 +18,6 @@ from PIL import Image
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.segments import KEPT, SegmentMaker, SegmentPlanner
-from sart_toolkit.augment.strategies import SamplingConfig
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import make_backend
 from sart_toolkit.errors import MotionRejected
@@ -26,6 +25,7 @@ from sart_toolkit.poses import interpolate
 from sart_toolkit.records import Annotation, PrecisionSphere, apply_action, convergence_waypoint
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.sampling import SamplingConfig
 from sart_toolkit.scene.certificate import certify
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.teach.scripted import ScriptedOperator

@@ -2,13 +2,15 @@
 
 import functools
 
+import numpy as np
 import pytest
 
 from sart_toolkit.backends import make_backend
 from sart_toolkit.evaluate.benchmark import Cell
-from sart_toolkit.evaluate.clouds import benchmark_clouds
+from sart_toolkit.evaluate.clouds import _on_robot, benchmark_clouds
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks import get_task
+from sart_toolkit.teach.suggest import ExactSurroundings
 
 
 @pytest.fixture(scope="module")
@@ -40,3 +42,12 @@ def test_the_cloud_s_points_lie_on_true_surfaces(compared):
     assert errors["points"] > 1000
     assert errors["median_mm"] <= errors["p95_mm"] <= errors["max_mm"]
     assert errors["median_mm"] < 3 and errors["p95_mm"] < 8
+    assert errors["on_robot"] == 0
+
+
+def test_a_point_on_the_robot_is_counted(peg_demonstration, peg_scene):
+    scene = ExactSurroundings(peg_scene)
+    Ts = peg_demonstration.steps.measured_Ts_world_tool[:, :3, 3]
+    points = np.array([Ts[0], Ts[-1], [0.0, 2.0, 0.0]])
+    assert _on_robot(points, scene, peg_demonstration, range(len(Ts))) == 2
+    assert _on_robot(points, scene, peg_demonstration, range(1)) == 1

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sart_toolkit.augment.strategies import SamplingConfig, sart
+from sart_toolkit.augment.strategies import sart
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import pose
 from sart_toolkit.records import convergence_waypoint
+from sart_toolkit.sampling import SamplingConfig
 from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.teach import suggest as suggest_module
 from sart_toolkit.teach.suggest import (
