@@ -344,6 +344,7 @@ class AnnotationWindow:
                 mesh = self._robot.meshes[i]
                 tool += _shaded(mesh, Ts[i]).transform(T_tool_world @ Ts[i])
             tool.paint_uniform_color(_FAINT)
+            tool = _textured(tool)
             for i in range(self._session.config.ghosts):
                 scene.remove_geometry(f"ghost {i}")
                 scene.add_geometry(f"ghost {i}", tool, _glass(0.25))
@@ -530,7 +531,7 @@ def _shaded(mesh: DrawnMesh, T_world_mesh: Array) -> Any:
     colours = np.repeat(bright[:, None] * np.array(mesh.rgba[:3]), 3, axis=0)
     made.vertex_colors = open3d.utility.Vector3dVector(colours)
     made.vertex_normals = open3d.utility.Vector3dVector(np.repeat(normals, 3, axis=0))
-    return _textured(made)
+    return made
 
 
 def _textured(mesh: Any) -> Any:

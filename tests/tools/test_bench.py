@@ -59,6 +59,7 @@ def test_the_certificate_benchmark_counts_verdicts_and_what_they_miss(capsys):
     [
         (["augment", "--repeats", "0"], "--repeats: expected a finite number > 0"),
         (["augment", "--task", "peg"], "unknown task 'peg'"),
+        (["annotate", "--points", "0"], "--points: expected a finite number > 0"),
         (["trian"], "unknown benchmark 'trian': did you mean 'train'"),
         (["train", "--policy", "compact"], "unknown policy 'compact': did you mean 'compact_mlp'"),
         (["train", "--blocks", "0"], "--blocks: expected a finite number > 0"),
