@@ -1,14 +1,17 @@
 """What a person does, done by machine hands in the real windows: `python tools/human_path.py DIR`.
 
-A screen that nobody looks at shows the windows, keys are pressed on it as fingers would, and
-pictures are taken. The hands know no more than eyes would tell them: where the tool is and what the
-window says, read from `--status`; and where the object stands. Each stage is a function and a line
-in `STAGES`; they leave what a person's work would leave in DIR.
+A demonstration is recorded with the keyboard and annotated, then augmented and trained on, and the
+skill is tried. A screen that nobody looks at shows the windows, keys are pressed on it as fingers
+would, and pictures are taken. The hands know no more than eyes would tell them: where the tool is
+and what the windows say, read from `--status` and from the annotator's journal; and where the
+object stands. Each stage is a function and a line in `STAGES`; they leave what a person's work
+would leave in DIR, and `human_path.json` tells what came of each.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 import time
@@ -18,11 +21,19 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.errors import SartError, unknown_name
+from sart_toolkit import doctor
+from sart_toolkit.errors import Mismatch, SartError, unknown_name
 from sart_toolkit.poses import Array, relative_motion
+from sart_toolkit.records import library_versions
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.storage import load_demonstration, read_json_lines
+from sart_toolkit.storage import (
+    load_annotation,
+    load_demonstration,
+    read_json,
+    read_json_lines,
+    write_json,
+)
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement, Stage
 from sart_toolkit.teach.devices.keyboard import KEYS
@@ -34,26 +45,44 @@ _SART = (sys.executable, "-c", "from sart_toolkit.cli import main; main()")
 _NEAR, _REACTION = 0.06, 0.2
 # Between the legs of the way a person looks where they are.
 _LOOK = 0.6
+# Keys of the annotator by their X names. By hand: a sphere at the start made larger in coarse
+# steps, then one at each convergence waypoint as far as there is room, save, leave.
+BY_HAND = ("Return", *["Up"] * 8, *["c", "Return"] * 4, "w", "q")
+SUGGESTED = ("a", "w", "q")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code of doing the named stages, or all."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("directory", type=Path, help="where the results go")
     parser.add_argument("--task", default="peg_in_hole", help="what is done")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the windows")
     parser.add_argument("--stages", nargs="*", default=list(STAGES), help=f"of {', '.join(STAGES)}")
+    parser.add_argument("--episodes", type=int, default=50, help="rollouts of the skill")
     options = parser.parse_args(arguments)
     pictures = options.pictures or options.directory / "pictures"
+    report_file = options.directory / "human_path.json"
     try:
-        for folder in (options.directory, pictures):
-            folder.mkdir(parents=True, exist_ok=True)
         for stage in options.stages:
             if stage not in STAGES:
                 raise unknown_name("stage", stage, STAGES)
+        get_task(options.task)
+        for folder in (options.directory, pictures):
+            folder.mkdir(parents=True, exist_ok=True)
+        report: dict[str, Any] = read_json(report_file) if report_file.exists() else {"stages": {}}
+        report |= {
+            "task": options.task,
+            "machine": doctor.machine(),
+            "versions": library_versions(),
+        }
+        for stage in options.stages:
             started = time.monotonic()
-            said = STAGES[stage](options.task, options.directory, pictures)
-            print(f"{stage:<9} {time.monotonic() - started:6.1f} s  {said}")
+            said = STAGES[stage](options, pictures)
+            seconds = round(time.monotonic() - started, 1)
+            report["stages"][stage] = said | {"wall_seconds": seconds}
+            write_json(report_file, report)
+            words = ", ".join(f"{k} {v}" for k, v in said.items() if not isinstance(v, list | dict))
+            print(f"{stage:<9} {seconds:6.1f} s  {words}")
     except (SartError, TimeoutError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -63,8 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 # --- recording ----------------------------------------------------------------------------------
 
 
-def record(name: str, directory: Path, pictures: Path) -> str:
+def record(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
     """What came of recording `demo.h5` with the keyboard; pictures of each phase are taken."""
+    name, directory = options.task, options.directory
     task = get_task(name)
     model = RobotModel(get_robot(task.robot), task.scene.held)
     out, status = directory / "demo.h5", directory / "status.jsonl"
@@ -92,7 +122,11 @@ def record(name: str, directory: Path, pictures: Path) -> str:
         if program.returncode != 0:
             raise TimeoutError(f"sart record ended with code {program.returncode}: {errors}{said}")
     shown = load_demonstration(out)
-    return f"{out}: {shown.timestamps[-1]:.1f} s long, {shown.seconds:.1f} s of a person's time"
+    return {
+        "recorded_seconds": round(float(shown.timestamps[-1]), 1),
+        "seconds_of_a_person": round(shown.seconds, 1),
+        "reached_the_goal": bool(shown.success[-1]),
+    }
 
 
 class _Hands:
@@ -173,8 +207,111 @@ class _Hands:
             self._gripper = wanted
 
 
-# Later stages may build on what earlier ones left in the directory.
-STAGES: dict[str, Callable[[str, Path, Path], str]] = {"record": record}
+# --- annotating ---------------------------------------------------------------------------------
+
+
+def annotate(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
+    """What came of annotating by hand: `annotation.json`."""
+    return _annotated(options, "annotation", BY_HAND, pictures)
+
+
+def suggest(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
+    """What came of taking all suggestions instead: `suggested.json`."""
+    return _annotated(options, "suggested", SUGGESTED, pictures)
+
+
+def _annotated(
+    options: argparse.Namespace, name: str, keys: Sequence[str], pictures: Path
+) -> dict[str, Any]:
+    """What came of pressing keys in the annotator's window, the last of which save and leave.
+
+    The next key is pressed once the one before has been done, which the journal tells; `seconds`
+    are those from the first key to the window's end, without those for a picture of it.
+    """
+    demo, out = options.directory / "demo.h5", options.directory / f"{name}.json"
+    journal = out.with_name(f"{out.name}.journal")
+    with Desktop() as desktop:
+        opened = time.monotonic()
+        program = desktop.start(
+            [*_SART, "annotate", str(demo), "--out", str(out), "--overwrite", "--json"]
+        )
+        desktop.window("sart annotate")
+        started = time.monotonic()
+        for key in keys[:-1]:
+            done = len(read_json_lines(journal))
+            desktop.key(key)
+            while program.poll() is None and len(read_json_lines(journal)) <= done:
+                time.sleep(0.01)
+        seconds = time.monotonic() - started
+        # With the whole cloud and the sampled poses, which wait until nothing is pressed.
+        time.sleep(3.0)
+        desktop.screenshot(pictures / f"annotate_{name}.png")
+        started_leaving = time.monotonic()
+        desktop.key(keys[-1])
+        said, errors = program.communicate(timeout=60)
+        seconds += time.monotonic() - started_leaving
+    if program.returncode != 0:
+        raise Mismatch(f"the annotator ended with {program.returncode}: {errors[-300:]}")
+    annotation = load_annotation(out)
+    annotation.check_matches(load_demonstration(demo))
+    return {
+        "presses": len(keys),
+        "presses_counted_by_the_annotator": json.loads(said)["presses"],
+        "seconds": round(seconds, 2),
+        "opening_seconds": round(started - opened, 2),
+        "seconds_in_the_file": annotation.seconds,
+        "spheres": [
+            {"waypoint": s.waypoint, "radius_mm": round(1e3 * s.radius, 1), "source": s.source}
+            for s in annotation.spheres
+        ],
+    }
+
+
+# --- learning -----------------------------------------------------------------------------------
+
+
+def augment(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
+    """What came of augmenting with the annotation by hand: `dataset/`."""
+    folder = options.directory
+    made = _sart("augment", folder / "demo.h5", folder / "annotation.json",
+                 "--out", folder / "dataset", "--workers", 2, "--overwrite")  # fmt: skip
+    return {name: made[name] for name in ("n_trajectories", "n_kept", "n_attempted")}
+
+
+def train(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
+    """What came of training on the dataset: `skill/`."""
+    folder = options.directory
+    made = _sart("train", folder / "dataset", "--out", folder / "skill", "--overwrite")
+    return {"policy": made["policy"], "seconds": made["seconds"]}
+
+
+def evaluate(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
+    """What came of trying the skill: `evaluation.json`."""
+    folder = options.directory
+    made = _sart("evaluate", folder / "skill", "--out", folder / "evaluation.json",
+                 "--episodes", options.episodes, "--workers", 2, "--overwrite")  # fmt: skip
+    return {name: made[name] for name in ("n_success", "n_episodes", "ci95")}
+
+
+def _sart(*arguments: object) -> dict[str, Any]:
+    """What a verb of `sart` says came of it."""
+    done = subprocess.run(
+        [*_SART, *map(str, arguments), "--json"], stdout=subprocess.PIPE, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise Mismatch(f"sart {arguments[0]} ended with {done.returncode}")
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+STAGES: dict[str, Callable[[argparse.Namespace, Path], dict[str, Any]]] = {
+    "record": record,
+    "annotate": annotate,
+    "suggest": suggest,
+    "augment": augment,
+    "train": train,
+    "evaluate": evaluate,
+}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from sart_toolkit.storage import load_demonstration
+from sart_toolkit.storage import load_annotation, load_demonstration, save_demonstration
 from sart_toolkit.testing.desktop import check_desktop
 
 _PATH = Path(__file__).parents[2] / "tools" / "human_path.py"
@@ -30,6 +30,31 @@ def test_a_demonstration_is_recorded_by_keys_alone_in_the_real_window(tmp_path, 
             assert picture.size == (1280, 800)
     rows = [json.loads(line) for line in (tmp_path / "status.jsonl").read_text().splitlines()]
     assert [rows[0]["phase"], rows[-1]["phase"]] == ["ready", "saved"]
+
+
+@pytest.mark.window
+def test_peg_in_hole_is_annotated_by_few_keys(tmp_path, peg_demonstration):
+    pytest.importorskip("open3d")
+    check_desktop()
+    save_demonstration(tmp_path / "demo.h5", peg_demonstration)
+    assert human_path.main([str(tmp_path), "--stages", "annotate", "suggest"]) == 0
+    report = json.loads((tmp_path / "human_path.json").read_text())["stages"]
+    assert report["annotate"]["presses"] <= 25 and report["suggest"]["presses"] <= 3
+    for stage, name, source in (
+        ("annotate", "annotation", "human"),
+        ("suggest", "suggested", "suggested"),
+    ):
+        row = report[stage]
+        assert row["presses_counted_by_the_annotator"] == row["presses"]
+        assert {sphere["source"] for sphere in row["spheres"]} == {source}
+        assert row["seconds"] > 0 and len(row["spheres"]) > 1
+        load_annotation(tmp_path / f"{name}.json").check_matches(peg_demonstration)
+        assert (tmp_path / "pictures" / f"annotate_{name}.png").stat().st_size > 10_000
+
+
+def test_a_stage_that_lacks_what_an_earlier_one_leaves_is_an_error(tmp_path, capsys):
+    assert human_path.main([str(tmp_path), "--stages", "train"]) == 2
+    assert "sart train ended with 2" in capsys.readouterr().err
 
 
 def test_an_unknown_task_is_one_line_and_exit_code_2(tmp_path, capsys):
