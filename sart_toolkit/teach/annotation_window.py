@@ -6,6 +6,7 @@ It draws what an `AnnotationSession` says and hands it the keys; nothing is deci
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import sys
 import textwrap
@@ -121,6 +122,9 @@ def _quiet_stdout() -> Iterator[None]:
     try:
         yield
     finally:
+        # What Python or C++ has not written yet must not follow once stdout is itself again.
+        sys.stdout.flush()
+        ctypes.CDLL(None).fflush(None)
         os.dup2(kept, 1)
         os.close(kept)
 
