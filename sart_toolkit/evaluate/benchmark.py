@@ -14,17 +14,11 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.backends.interface import Backend, BackendFactory
-from sart_toolkit.errors import InvalidInput, Mismatch, SartError
+from sart_toolkit.errors import InvalidInput, SartError
+from sart_toolkit.evaluate.result_log import ResultLog
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.records import Demonstration, library_versions
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.storage import (
-    append_json_line,
-    check_writable,
-    read_json_lines,
-    remove,
-    write_json,
-)
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.teach.replay import replay_demonstration, tracking_difference
 from sart_toolkit.teach.scripted import ScriptedOperator
@@ -130,23 +124,10 @@ def benchmark_operator(
         InvalidInput: a task's objects can't be turned so far.
         CannotWrite: the disk refuses.
     """
-    check_writable(out, overwrite)
     for cell in cells:
         cell.task.sample_placement(np.random.default_rng(config.seed), config.yaw_deg)
-    log = out.with_suffix(".partial.jsonl")
-    request = {"seed": config.seed, "yaw_deg": config.yaw_deg}
-    if overwrite:
-        remove(log)
-    lines = read_json_lines(log)
-    if lines and lines[0] != request:
-        raise Mismatch(
-            f"{log}: holds episodes of {lines[0]}, not {request}; add --overwrite or choose "
-            "another --out"
-        )
-    if not lines:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        append_json_line(log, request)
-    rows = {(row["cell"], row["episode"]): row for row in lines[1:]}
+    log = ResultLog(out, {"seed": config.seed, "yaw_deg": config.yaw_deg}, overwrite)
+    rows = {(row["cell"], row["episode"]): row for row in log.rows}
     wanted = [(cell.name, i) for cell in cells for i in range(config.episodes)]
     missing = [item for item in wanted if item not in rows]
     done = len(wanted) - len(missing)
@@ -154,7 +135,7 @@ def benchmark_operator(
     with worker_map(functools.partial(_Operator, cells, config), workers) as run:
         for item, row in zip(missing, run(missing), strict=True):
             rows[item] = row
-            append_json_line(log, row)
+            log.add(row)
             done += 1
             successes += row["success"]
             if progress is not None:
@@ -162,10 +143,7 @@ def benchmark_operator(
     table = {
         cell.name: _summary([rows[cell.name, i] for i in range(config.episodes)]) for cell in cells
     }
-    result = {"config": asdict(config), "cells": table, "versions": library_versions()}
-    write_json(out, result)
-    remove(log)
-    return result
+    return log.finish({"config": asdict(config), "cells": table, "versions": library_versions()})
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -76,8 +76,10 @@ def _on_robot(
         Ts = placed.joint_poses(shown.steps.joint_positions[t])
         for part in placed.parts:
             if part.joint > 0:
-                T, hull = Ts[part.joint], hulls.setdefault(part, Hull(part.points))
-                covered |= hull.near((points - T[:3, 3]) @ T[:3, :3], 0.0)
+                if part not in hulls:
+                    hulls[part] = Hull(part.points)
+                T = Ts[part.joint]
+                covered |= hulls[part].near((points - T[:3, 3]) @ T[:3, :3], 0.0)
     return int(covered.sum())
 
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.benchmark import Cell
-from sart_toolkit.evaluate.running import ResultLog, check_counts, recorded
+from sart_toolkit.evaluate.result_log import ResultLog
+from sart_toolkit.evaluate.running import check_counts, recorded
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.poses import Array, exp_rotation, inverse
 from sart_toolkit.records import (

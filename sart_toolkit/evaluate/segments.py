@@ -18,7 +18,8 @@ from sart_toolkit.augment.segments import KEPT, SegmentMaker, SegmentPlanner
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.benchmark import Cell
-from sart_toolkit.evaluate.running import ResultLog, check_counts, recorded
+from sart_toolkit.evaluate.result_log import ResultLog
+from sart_toolkit.evaluate.running import check_counts, recorded
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.motion.path import nearest_on_polyline
 from sart_toolkit.motion.timing import Motion

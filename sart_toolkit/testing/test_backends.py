@@ -85,9 +85,11 @@ def test_two_instances_are_independent(bench: Bench, another: Make) -> None:
 
 def test_closing_twice_does_nothing(bench: Bench) -> None:
     """So that a `finally` may close what was closed."""
+    before = bench.digest()
     made = find_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16)
     made.close()
     made.close()
+    assert bench.digest() == before
 
 
 def test_closing_one_instance_leaves_others_alone(bench: Bench) -> None:
