@@ -9,67 +9,67 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sart_toolkit.annotate.suggest import ExactSurroundings, SuggestConfig, suggest_annotation
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.engine import augment_demonstration
     from sart_toolkit.augment.validate import validate_dataset
     from sart_toolkit.backends import make_backend
-    from sart_toolkit.evaluate.report import write_report
-    from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
-    from sart_toolkit.learn.skill import load_skill, save_skill
-    from sart_toolkit.learn.training import TrainConfig, train
-    from sart_toolkit.robots import get_robot
-    from sart_toolkit.robots.model import RobotModel
-    from sart_toolkit.sampling import SamplingConfig
-    from sart_toolkit.scene.appearance import vary_appearance
-    from sart_toolkit.scene.certificate import certify
-    from sart_toolkit.scene.collision import CollisionModel
-    from sart_toolkit.scene.demonstrated import DemonstratedScene
-    from sart_toolkit.storage import (
+    from sart_toolkit.collision.certificate import certify
+    from sart_toolkit.collision.demonstrated import DemonstratedScene
+    from sart_toolkit.collision.model import CollisionModel
+    from sart_toolkit.data.sampling import SamplingConfig
+    from sart_toolkit.data.storage import (
         load_annotation,
         load_dataset,
         load_demonstration,
         save_annotation,
         save_demonstration,
     )
+    from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
+    from sart_toolkit.learn.skill import load_skill, save_skill
+    from sart_toolkit.learn.training import TrainConfig, train
+    from sart_toolkit.record.replay import replay_demonstration
+    from sart_toolkit.record.scripted import ScriptedOperator
+    from sart_toolkit.record.session import record_demonstration
+    from sart_toolkit.report.page import write_report
+    from sart_toolkit.robots import get_robot
+    from sart_toolkit.robots.model import RobotModel
+    from sart_toolkit.scenes.appearance import vary_appearance
     from sart_toolkit.tasks import get_task
     from sart_toolkit.tasks.task import Placement
-    from sart_toolkit.teach.replay import replay_demonstration
-    from sart_toolkit.teach.scripted import ScriptedOperator
-    from sart_toolkit.teach.session import record_demonstration
-    from sart_toolkit.teach.suggest import ExactSurroundings, SuggestConfig, suggest_annotation
 
 _HOMES = {
     "AugmentConfig": "augment.config",
-    "CollisionModel": "scene.collision",
-    "DemonstratedScene": "scene.demonstrated",
+    "CollisionModel": "collision.model",
+    "DemonstratedScene": "collision.demonstrated",
     "EvaluateConfig": "evaluate.rollout",
-    "ExactSurroundings": "teach.suggest",
+    "ExactSurroundings": "annotate.suggest",
     "Placement": "tasks.task",
     "RobotModel": "robots.model",
-    "SamplingConfig": "sampling",
-    "ScriptedOperator": "teach.scripted",
-    "SuggestConfig": "teach.suggest",
+    "SamplingConfig": "data.sampling",
+    "ScriptedOperator": "record.scripted",
+    "SuggestConfig": "annotate.suggest",
     "TrainConfig": "learn.training",
     "augment_demonstration": "augment.engine",
-    "certify": "scene.certificate",
+    "certify": "collision.certificate",
     "evaluate_skill": "evaluate.rollout",
     "get_robot": "robots",
     "get_task": "tasks",
-    "load_annotation": "storage",
-    "load_dataset": "storage",
-    "load_demonstration": "storage",
+    "load_annotation": "data.storage",
+    "load_dataset": "data.storage",
+    "load_demonstration": "data.storage",
     "load_skill": "learn.skill",
     "make_backend": "backends",
-    "record_demonstration": "teach.session",
-    "replay_demonstration": "teach.replay",
-    "save_annotation": "storage",
-    "save_demonstration": "storage",
+    "record_demonstration": "record.session",
+    "replay_demonstration": "record.replay",
+    "save_annotation": "data.storage",
+    "save_demonstration": "data.storage",
     "save_skill": "learn.skill",
-    "suggest_annotation": "teach.suggest",
+    "suggest_annotation": "annotate.suggest",
     "train": "learn.training",
     "validate_dataset": "augment.validate",
-    "vary_appearance": "scene.appearance",
-    "write_report": "evaluate.report",
+    "vary_appearance": "scenes.appearance",
+    "write_report": "report.page",
 }
 __all__ = [
     "AugmentConfig",

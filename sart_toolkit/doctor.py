@@ -292,7 +292,7 @@ def probe_teleop_window() -> str:
     """Which display showed a window of pygame's."""
     import pygame  # noqa: F401 - its absence has a remedy of its own
 
-    from sart_toolkit.teach.screen import Screen
+    from sart_toolkit.record.screen import Screen
 
     try:
         with Screen("sart doctor") as screen:
@@ -307,7 +307,7 @@ def probe_spacemouse() -> str:
     """What hidapi is, and whether it finds a SpaceMouse; none is no fault."""
     import hid
 
-    from sart_toolkit.teach.devices.spacemouse import is_spacemouse
+    from sart_toolkit.record.devices.spacemouse import is_spacemouse
 
     found = [info["product_string"] for info in hid.enumerate() if is_spacemouse(info)]
     return f"{_version('hidapi')}, finds {', '.join(found) or 'none plugged in'}"

@@ -10,19 +10,19 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import make_backend
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.records import Annotation, Dataset, Demonstration
+from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.data.records import Annotation, Dataset, Demonstration
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement, Task
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 PICTURE_SIZE = 48
 

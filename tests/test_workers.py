@@ -7,7 +7,7 @@ import os
 import pytest
 
 from sart_toolkit.errors import InvalidInput, SartError
-from sart_toolkit.tables import lookup
+from sart_toolkit.registry import lookup
 from sart_toolkit.workers import worker_map
 
 

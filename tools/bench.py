@@ -23,26 +23,17 @@ import numpy as np
 import torch
 
 from sart_toolkit import doctor
+from sart_toolkit.annotate.session import AnnotationSession
+from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.errors import InvalidInput, MotionRejected, SartError, Unreachable, unknown_name
-from sart_toolkit.learn.policies import POLICIES
-from sart_toolkit.learn.training import (
-    TrainConfig,
-    build_policy,
-    make_optimizer,
-    resolve_bfloat16,
-    resolve_device,
-    train,
-)
-from sart_toolkit.learn.windows import Batch, build_windows
-from sart_toolkit.motion.controller import ToolController
-from sart_toolkit.motion.line import straight_line
-from sart_toolkit.motion.path import SplinePath
-from sart_toolkit.poses import Array, apply_motion, check_positive, inverse, pose
-from sart_toolkit.records import (
+from sart_toolkit.collision.certificate import certify
+from sart_toolkit.collision.cloud import fuse_cloud
+from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.model import CollisionModel, PlacedModel
+from sart_toolkit.data.records import (
     CONTROL_HZ,
     Annotation,
     CameraRecord,
@@ -54,26 +45,35 @@ from sart_toolkit.records import (
     Steps,
     library_versions,
 )
+from sart_toolkit.data.storage import load_demonstration, save_demonstration
+from sart_toolkit.errors import InvalidInput, MotionRejected, SartError, Unreachable, unknown_name
+from sart_toolkit.learn.policies import POLICIES
+from sart_toolkit.learn.samples import Batch, build_windows
+from sart_toolkit.learn.training import (
+    TrainConfig,
+    build_policy,
+    make_optimizer,
+    resolve_bfloat16,
+    resolve_device,
+    train,
+)
+from sart_toolkit.motion.controller import ToolController
+from sart_toolkit.motion.line import straight_line
+from sart_toolkit.motion.path import SplinePath
+from sart_toolkit.poses import Array, apply_motion, check_positive, inverse, pose
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.certificate import certify
-from sart_toolkit.scene.cloud import fuse_cloud
-from sart_toolkit.scene.collision import CollisionModel, PlacedModel
-from sart_toolkit.scene.demonstrated import DemonstratedScene
-from sart_toolkit.scene.spec import SceneSpec
-from sart_toolkit.storage import load_demonstration, save_demonstration
+from sart_toolkit.scenes.spec import SceneSpec
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
-from sart_toolkit.teach.annotation import AnnotationSession
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.testing.closest import ClosestPoints
 from sart_toolkit.testing.clutter import CLUTTER, Segment, random_segment
 from sart_toolkit.testing.desktop import Desktop
 
 if TYPE_CHECKING:
-    from sart_toolkit.teach.annotation_window import WindowConfig
+    from sart_toolkit.annotate.open3d_window import WindowConfig
 
 _DEMONSTRATION_STEPS = 60
 _SEGMENT_STEPS = 20
@@ -587,7 +587,7 @@ def bench_annotate(arguments: Sequence[str]) -> dict[str, Any]:
         _show_window(options.window, options.points)
         return {}
     # Open3D is an extra, which the other benchmarks do without.
-    from sart_toolkit.teach.annotation_window import WindowConfig
+    from sart_toolkit.annotate.open3d_window import WindowConfig
 
     task = get_task("peg_in_hole")
     robot = get_robot(task.robot)
@@ -674,7 +674,7 @@ def _at_rest(screen: Desktop, seconds: float) -> bytes:
 
 def _show_window(folder: Path, points: int) -> None:
     """The annotator with so many points: those of the pictures, several times with some noise."""
-    from sart_toolkit.teach.annotation_window import annotate_in_window
+    from sart_toolkit.annotate.open3d_window import annotate_in_window
 
     demonstration = load_demonstration(folder / "demo.h5")
     task, robot = get_task(demonstration.task), get_robot(demonstration.robot)

@@ -22,22 +22,22 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit import doctor
-from sart_toolkit.errors import Mismatch, SartError, unknown_name
-from sart_toolkit.poses import Array, relative_motion
-from sart_toolkit.records import library_versions
-from sart_toolkit.robots import get_robot
-from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.storage import (
+from sart_toolkit.data.records import library_versions
+from sart_toolkit.data.storage import (
     load_annotation,
     load_demonstration,
     read_json,
     read_json_lines,
     write_json,
 )
+from sart_toolkit.errors import Mismatch, SartError, unknown_name
+from sart_toolkit.poses import Array, relative_motion
+from sart_toolkit.record.devices.keyboard import KEYS
+from sart_toolkit.record.devices.manual import SPEEDS, views
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement, Stage
-from sart_toolkit.teach.devices.keyboard import KEYS
-from sart_toolkit.teach.devices.manual import SPEEDS, views
 from sart_toolkit.testing.desktop import Desktop
 
 _SART = (sys.executable, "-c", "from sart_toolkit.cli import main; main()")
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def record(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
-    """What came of recording `demo.h5` with the keyboard; pictures of each phase are taken."""
+    """What came of recording `demo.h5` with the keyboard; pictures of each state are taken."""
     name, directory = options.task, options.directory
     task = get_task(name)
     model = RobotModel(get_robot(task.robot), task.scene.held)
@@ -105,18 +105,18 @@ def record(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
         )  # fmt: skip
         desktop.window(f"sart record {name}")
         hands = _Hands(desktop, program, status, views(model, task.scene).R_world_hand)
-        hands.see("phase", "ready")
+        hands.see("state", "ready")
         time.sleep(_LOOK)
         desktop.screenshot(pictures / "record_ready.png")
         desktop.key("Right")
         for leg in task.plan(task.initial_state(model, Placement())):
             hands.steer(leg)
-            if hands.look()["phase"] == "recording":
+            if hands.look()["state"] == "recording":
                 desktop.screenshot(pictures / "record_recording.png")
-        hands.see("phase", "ended")
+        hands.see("state", "ended")
         desktop.screenshot(pictures / "record_ended.png")
         desktop.key("Right")
-        hands.see("phase", "saved")
+        hands.see("state", "saved")
         desktop.screenshot(pictures / "record_saved.png")
         said, errors = program.communicate(timeout=60)
         if program.returncode != 0:
@@ -165,10 +165,10 @@ class _Hands:
     def steer(self, leg: Stage, timeout_s: float = 60.0) -> None:
         """Bring the tool to the end of a leg, or until the recording ends by itself."""
         deadline = time.monotonic() + timeout_s
-        while (now := self.look())["phase"] != "ended":
+        while (now := self.look())["state"] != "ended":
             if time.monotonic() > deadline:
                 raise TimeoutError(f"the tool did not get there: {now['notice']}")
-            if now["phase"] == "recording":
+            if now["state"] == "recording":
                 self._close_or_open(now["gripper"], leg.gripper)
                 speed, wanted = self._keys(np.array(now["T_world_tool"]), leg)
                 self._choose_speed(speed)

@@ -26,20 +26,20 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.segments import SegmentPlanner
+from sart_toolkit.augment.execution import SegmentPlanner
 from sart_toolkit.backends import make_backend
+from sart_toolkit.data.records import Annotation, Demonstration, PrecisionSphere
+from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import MotionRejected, SartError, Unreachable
 from sart_toolkit.poses import Array, pose
-from sart_toolkit.records import Annotation, Demonstration, PrecisionSphere
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import CameraSpec, Shape, look_at
-from sart_toolkit.sampling import SamplingConfig
-from sart_toolkit.scene.spec import Body
+from sart_toolkit.scenes.spec import Body
 from sart_toolkit.tasks.peg_in_hole import PegInHole
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
 
 _DRAWS = 60
 _RADIUS = 0.18

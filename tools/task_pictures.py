@@ -15,14 +15,14 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.data.records import Demonstration
 from sart_toolkit.errors import SartError
-from sart_toolkit.records import Demonstration
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
 
 _SIZE, _GAP, _LABEL = 176, 4, 22
 _MOMENTS = 6

@@ -8,7 +8,7 @@ import numpy as np
 import sart_toolkit as sart
 from sart_toolkit.backends.interface import Backend, Capabilities, Observation
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
-from sart_toolkit.records import CONTROL_HZ
+from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.robots.spec import check_gripper
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sart_toolkit.augment.strategies import get_strategy
+from sart_toolkit.collision.demonstrated import GRASP_PLAY
+from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
-from sart_toolkit.sampling import SamplingConfig
-from sart_toolkit.scene.demonstrated import GRASP_PLAY
 
 SHARES = ("radius", "equal")
 

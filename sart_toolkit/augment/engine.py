@@ -14,23 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.segments import KEPT, SegmentMaker
+from sart_toolkit.augment.execution import KEPT, SegmentMaker
 from sart_toolkit.backends.interface import BackendFactory
-from sart_toolkit.errors import (
-    BrokenFile,
-    InvalidInput,
-    Mismatch,
-    MissingCapability,
-    OutputExists,
-    unknown_name,
-)
-from sart_toolkit.records import (
+from sart_toolkit.data.records import (
     Annotation,
     Dataset,
     Demonstration,
     library_versions,
 )
-from sart_toolkit.storage import (
+from sart_toolkit.data.storage import (
     annotation_to_json,
     append_json_line,
     clear_directory,
@@ -46,6 +38,14 @@ from sart_toolkit.storage import (
     save_episode,
     write_json,
     write_text,
+)
+from sart_toolkit.errors import (
+    BrokenFile,
+    InvalidInput,
+    Mismatch,
+    MissingCapability,
+    OutputExists,
+    unknown_name,
 )
 from sart_toolkit.workers import worker_map
 

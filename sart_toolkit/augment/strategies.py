@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sart_toolkit.data.records import Demonstration, PrecisionSphere, convergence_waypoint
+from sart_toolkit.data.sampling import SamplingConfig, sample_in_region, sample_pose
 from sart_toolkit.errors import unknown_name
 from sart_toolkit.motion.planning import check_planner
 from sart_toolkit.poses import Array, frozen
-from sart_toolkit.records import Demonstration, PrecisionSphere, convergence_waypoint
-from sart_toolkit.sampling import SamplingConfig, sample_in_region, sample_pose
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.segments import SegmentPlanner, path_deviation
-from sart_toolkit.errors import BrokenFile, MotionRejected, SartError
-from sart_toolkit.motion.path import PolylinePath
-from sart_toolkit.motion.timing import Motion
-from sart_toolkit.poses import Array
-from sart_toolkit.records import (
+from sart_toolkit.augment.execution import SegmentPlanner, path_deviation
+from sart_toolkit.collision.certificate import Certificate, certify
+from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.data.records import (
     RECORD_HZ,
     Annotation,
     Dataset,
@@ -23,17 +21,19 @@ from sart_toolkit.records import (
     Episode,
     apply_action,
 )
-from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.sampling import SamplingConfig
-from sart_toolkit.scene.certificate import Certificate, certify
-from sart_toolkit.scene.collision import PlacedModel
-from sart_toolkit.scene.spec import SceneSpec
-from sart_toolkit.storage import (
+from sart_toolkit.data.sampling import SamplingConfig
+from sart_toolkit.data.storage import (
     load_annotation,
     load_dataset_info,
     load_demonstration,
     load_episode,
 )
+from sart_toolkit.errors import BrokenFile, MotionRejected, SartError
+from sart_toolkit.motion.path import PolylinePath
+from sart_toolkit.motion.timing import Motion
+from sart_toolkit.poses import Array
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.scenes.spec import SceneSpec
 
 # Clearances are stored in hundredths of a millimetre, rounded down, deviations in micrometres.
 _LENGTH_TOLERANCE = 5e-6

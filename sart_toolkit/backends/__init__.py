@@ -6,9 +6,9 @@ A new backend is one file and one line in `BACKENDS`.
 from __future__ import annotations
 
 from sart_toolkit.backends.interface import Backend
+from sart_toolkit.registry import lookup
 from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.scene.spec import SceneSpec
-from sart_toolkit.tables import lookup
+from sart_toolkit.scenes.spec import SceneSpec
 
 BACKENDS = {
     "pybullet": "sart_toolkit.backends.pybullet:PyBulletBackend",

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sart_toolkit.data.records import DepthImage, Image
 from sart_toolkit.errors import InvalidInput, MissingCapability, unknown_name
 from sart_toolkit.poses import Array
-from sart_toolkit.records import DepthImage, Image
 from sart_toolkit.robots.spec import CameraSpec, RobotSpec
-from sart_toolkit.scene.spec import SceneSpec, SceneState
+from sart_toolkit.scenes.spec import SceneSpec, SceneState
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,13 @@ from sart_toolkit.backends.interface import (
     check_size,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
+from sart_toolkit.data.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.poses import Array, inverse
-from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec, check_gripper
 from sart_toolkit.robots.urdf import add_joint, rigid_link
-from sart_toolkit.scene.spec import Body, Joint, SceneSpec, SceneState
+from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 
 
 @contextmanager

@@ -31,13 +31,13 @@ from sart_toolkit.backends.sapien_pictures import (
     why_no_pictures,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
+from sart_toolkit.collision.model import primitive
+from sart_toolkit.data.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.errors import InvalidInput, MissingCapability, SartError
 from sart_toolkit.poses import Array
-from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec, Shape, check_gripper, mass_properties
-from sart_toolkit.scene.collision import primitive
-from sart_toolkit.scene.spec import Body, Joint, SceneSpec, SceneState
+from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 
 _STEPS = PHYSICS_HZ // CONTROL_HZ
 # Solver iterations: fewer let fingers sink into what they squeeze.

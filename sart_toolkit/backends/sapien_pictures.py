@@ -23,12 +23,12 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit.backends.interface import CameraView
+from sart_toolkit.collision.model import primitive
 from sart_toolkit.errors import CannotWrite, MissingCapability, MissingExtra
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.spec import CameraSpec, Shape
 from sart_toolkit.robots.urdf import cache_dir
-from sart_toolkit.scene.collision import primitive
-from sart_toolkit.scene.spec import Light, SceneSpec
+from sart_toolkit.scenes.spec import Light, SceneSpec
 
 try:
     with warnings.catch_warnings():

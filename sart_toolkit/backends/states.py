@@ -12,7 +12,7 @@ import numpy as np
 
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scenes.spec import SceneSpec
 
 _VERSION = 3
 

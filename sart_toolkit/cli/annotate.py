@@ -12,8 +12,20 @@ from pathlib import Path
 from typing import Any
 
 from sart_toolkit import doctor
+from sart_toolkit.annotate.cloud import CloudSurroundings
+from sart_toolkit.annotate.session import ACTIONS, KEYS, AnnotateConfig, AnnotationSession
+from sart_toolkit.annotate.suggest import ExactSurroundings, SuggestConfig, Surroundings
 from sart_toolkit.cli.arguments import Annotate, Suggest
 from sart_toolkit.cli.console import say
+from sart_toolkit.collision.cloud import CloudConfig
+from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.data.storage import (
+    Journal,
+    check_writable,
+    load_annotation,
+    load_demonstration,
+)
 from sart_toolkit.errors import (
     InvalidInput,
     Mismatch,
@@ -21,20 +33,8 @@ from sart_toolkit.errors import (
     OutputExists,
     SartError,
 )
-from sart_toolkit.records import Annotation, Demonstration
 from sart_toolkit.robots import get_robot
-from sart_toolkit.scene.cloud import CloudConfig
-from sart_toolkit.scene.demonstrated import DemonstratedScene
-from sart_toolkit.storage import (
-    Journal,
-    check_writable,
-    load_annotation,
-    load_demonstration,
-)
 from sart_toolkit.tasks import get_task
-from sart_toolkit.teach.annotation import ACTIONS, KEYS, AnnotateConfig, AnnotationSession
-from sart_toolkit.teach.cloud import CloudSurroundings
-from sart_toolkit.teach.suggest import ExactSurroundings, SuggestConfig, Surroundings
 
 Result = dict[str, Any]
 _WITHOUT = "or work without a window: --text, or --suggest-all --no-window"
@@ -148,7 +148,7 @@ def _check_done(session: AnnotationSession) -> None:
 
 
 def _window_mode(session: AnnotationSession) -> None:
-    window = importlib.import_module("sart_toolkit.teach.annotation_window")
+    window = importlib.import_module("sart_toolkit.annotate.open3d_window")
     robot, scene = get_robot(session.demonstration.robot), get_task(session.demonstration.task)
     window.annotate_in_window(session, robot, scene.scene)
 

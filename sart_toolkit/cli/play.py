@@ -7,13 +7,13 @@ from typing import Any
 
 from sart_toolkit.cli.arguments import Play
 from sart_toolkit.cli.console import progress_bar
+from sart_toolkit.data.records import RECORD_HZ, Demonstration
+from sart_toolkit.data.storage import check_writable, load_demonstration, load_recording
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile
-from sart_toolkit.evaluate.player import Playback, PlayWindow, SceneView, film
-from sart_toolkit.evaluate.video import write_video
 from sart_toolkit.poses import check_positive
-from sart_toolkit.records import RECORD_HZ, Demonstration
-from sart_toolkit.storage import check_writable, load_demonstration, load_recording
-from sart_toolkit.teach.screen import Screen
+from sart_toolkit.record.screen import Screen
+from sart_toolkit.report.player import Playback, PlayWindow, SceneView, film
+from sart_toolkit.report.video import write_video
 
 
 def load_playback(path: Path) -> Playback:

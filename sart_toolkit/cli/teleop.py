@@ -10,17 +10,17 @@ import numpy as np
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.cli.arguments import Record
 from sart_toolkit.cli.console import say
+from sart_toolkit.data.records import CONTROL_HZ, Demonstration
+from sart_toolkit.data.storage import append_json_line, check_writable, remove, save_demonstration
 from sart_toolkit.errors import Discarded, InvalidInput, MissingCapability, NoDisplay
 from sart_toolkit.motion.controller import ControllerConfig
-from sart_toolkit.records import CONTROL_HZ, Demonstration
+from sart_toolkit.record.desk import RecordingDesk
+from sart_toolkit.record.devices.manual import ManualDevice
+from sart_toolkit.record.screen import Screen, start_sdl
+from sart_toolkit.record.session import SessionConfig, TeleopSession
+from sart_toolkit.record.window import RecordingWindow
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.storage import append_json_line, check_writable, remove, save_demonstration
 from sart_toolkit.tasks.task import Placement, Task
-from sart_toolkit.teach.desk import RecordingDesk
-from sart_toolkit.teach.devices.manual import ManualDevice
-from sart_toolkit.teach.screen import Screen, start_sdl
-from sart_toolkit.teach.session import SessionConfig, TeleopSession
-from sart_toolkit.teach.window import RecordingWindow
 
 
 def record_by_hand(

@@ -16,11 +16,21 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit import doctor
+from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import BackendFactory
+from sart_toolkit.benchmark.clouds import benchmark_clouds
+from sart_toolkit.benchmark.operator import (
+    BenchmarkConfig,
+    Cell,
+    benchmark_operator,
+    benchmark_replay,
+)
+from sart_toolkit.benchmark.radii import RadiiConfig, benchmark_radii
+from sart_toolkit.benchmark.segments import SegmentsConfig, benchmark_segments
 from sart_toolkit.cli.annotate import (
     annotate_verb,
     describe_spheres,
@@ -48,27 +58,9 @@ from sart_toolkit.cli.arguments import (
 from sart_toolkit.cli.console import progress_bar, say, show
 from sart_toolkit.cli.play import check_play_options, load_playback, play
 from sart_toolkit.cli.teleop import check_hand_options, record_by_hand
-from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
-from sart_toolkit.evaluate.benchmark import (
-    BenchmarkConfig,
-    Cell,
-    benchmark_operator,
-    benchmark_replay,
-)
-from sart_toolkit.evaluate.clouds import benchmark_clouds
-from sart_toolkit.evaluate.player import SceneView
-from sart_toolkit.evaluate.radii import RadiiConfig, benchmark_radii
-from sart_toolkit.evaluate.report import write_report
-from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
-from sart_toolkit.evaluate.segments import SegmentsConfig, benchmark_segments
-from sart_toolkit.learn.skill import load_skill, save_skill
-from sart_toolkit.learn.training import TrainConfig, train
-from sart_toolkit.records import Dataset, Demonstration, library_versions
-from sart_toolkit.robots import get_robot
-from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.sampling import SamplingConfig
-from sart_toolkit.scene.appearance import vary_appearance
-from sart_toolkit.storage import (
+from sart_toolkit.data.records import Dataset, Demonstration, library_versions
+from sart_toolkit.data.sampling import SamplingConfig
+from sart_toolkit.data.storage import (
     check_writable,
     clear_directory,
     load_annotation,
@@ -81,12 +73,20 @@ from sart_toolkit.storage import (
     save_demonstration,
     write_json,
 )
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
+from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
+from sart_toolkit.learn.skill import load_skill, save_skill
+from sart_toolkit.learn.training import TrainConfig, train
+from sart_toolkit.record.devices import make_device
+from sart_toolkit.record.devices.manual import ManualDevice
+from sart_toolkit.record.session import DeviceSetup, SessionConfig, record_demonstration
+from sart_toolkit.report.page import write_report
+from sart_toolkit.report.player import SceneView
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.scenes.appearance import vary_appearance
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
-from sart_toolkit.teach.devices import make_device
-from sart_toolkit.teach.devices.manual import ManualDevice
-from sart_toolkit.teach.session import DeviceSetup, SessionConfig, record_demonstration
-from sart_toolkit.teach.suggest import suggest_annotation
 from sart_toolkit.testing.closest import ClosestPoints
 
 Result = dict[str, Any]

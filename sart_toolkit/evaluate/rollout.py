@@ -14,21 +14,21 @@ import numpy as np
 import torch
 
 from sart_toolkit.backends.interface import Backend, BackendFactory
-from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
-from sart_toolkit.evaluate.statistics import wilson_interval
-from sart_toolkit.evaluate.video import Outcome, caption, inset, write_video
-from sart_toolkit.learn.skill import Skill, load_skill
-from sart_toolkit.motion.controller import ToolController
-from sart_toolkit.records import (
+from sart_toolkit.data.records import (
     CONTROL_PER_RECORD,
     RECORD_HZ,
     Image,
     apply_action,
     library_versions,
 )
+from sart_toolkit.data.storage import write_json
+from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
+from sart_toolkit.evaluate.statistics import wilson_interval
+from sart_toolkit.learn.skill import Skill, load_skill
+from sart_toolkit.motion.controller import ToolController
+from sart_toolkit.report.video import Outcome, caption, inset, write_video
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.appearance import vary_appearance
-from sart_toolkit.storage import write_json
+from sart_toolkit.scenes.appearance import vary_appearance
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.workers import worker_map
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from sart_toolkit.data.records import ACTION_SIZE
 from sart_toolkit.learn.policies.encoder import Encoder
-from sart_toolkit.learn.windows import Normalisation
-from sart_toolkit.records import ACTION_SIZE
+from sart_toolkit.learn.samples import Normalisation
 
 STATE_FEATURE = 512
 

@@ -12,9 +12,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from sart_toolkit import storage
+from sart_toolkit.data import storage
+from sart_toolkit.data.records import (
+    Annotation,
+    Dataset,
+    Demonstration,
+    Image,
+    library_versions,
+)
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, SartError
 from sart_toolkit.learn.model import Policy
+from sart_toolkit.learn.samples import resize_area
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.training import (
     CHECKPOINT,
@@ -23,15 +31,7 @@ from sart_toolkit.learn.training import (
     build_policy,
     resolve_device,
 )
-from sart_toolkit.learn.windows import resize_area
 from sart_toolkit.poses import Array, check_array, check_pose, frozen
-from sart_toolkit.records import (
-    Annotation,
-    Dataset,
-    Demonstration,
-    Image,
-    library_versions,
-)
 
 # A gripper that is told to open and to close knows two; more stand for a finger on a trigger.
 _FEW_GRIPPER_COMMANDS = 4

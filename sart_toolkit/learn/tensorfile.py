@@ -11,8 +11,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from sart_toolkit.data.storage import SCHEMA_VERSION, replacing
 from sart_toolkit.errors import BrokenFile, MissingFile
-from sart_toolkit.storage import SCHEMA_VERSION, replacing
 
 _KEY = "sart_toolkit"
 

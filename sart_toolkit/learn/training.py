@@ -19,14 +19,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sart_toolkit.data.records import Dataset
+from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
 from sart_toolkit.learn.model import Policy
 from sart_toolkit.learn.policies import get_encoder
+from sart_toolkit.learn.samples import build_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
-from sart_toolkit.learn.windows import build_windows
 from sart_toolkit.poses import check_positive
-from sart_toolkit.records import Dataset
-from sart_toolkit.storage import check_writable
 
 CHECKPOINT = "checkpoint.safetensors"
 _CHECKPOINT_SECONDS = 30.0

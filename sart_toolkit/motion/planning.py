@@ -18,14 +18,14 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import BSpline
 
+from sart_toolkit.collision.certificate import Certificate, certify
+from sart_toolkit.collision.model import PlacedModel, gap_text
+from sart_toolkit.data.records import RECORD_HZ
 from sart_toolkit.errors import InvalidInput, MissingExtra, MotionRejected, Unreachable
 from sart_toolkit.motion.path import PolylinePath, SplinePath
 from sart_toolkit.motion.timing import Motion, timed
 from sart_toolkit.poses import Array, check_pose, check_positive, distance, interpolate
-from sart_toolkit.records import RECORD_HZ
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.certificate import Certificate, certify
-from sart_toolkit.scene.collision import PlacedModel, gap_text
 
 _DEGREE = 5
 # Control points of the smooth path. The fewest make the smoothest; the most follow its corners.

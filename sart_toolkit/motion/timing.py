@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, Trajectory
 
+from sart_toolkit.data.records import RECORD_HZ
 from sart_toolkit.errors import MotionRejected
 from sart_toolkit.motion.path import SplinePath
 from sart_toolkit.poses import Array, check_positive
-from sart_toolkit.records import RECORD_HZ
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 

@@ -5,8 +5,8 @@ A new robot is one file with a `SPEC` and one line in `ROBOTS`.
 
 from __future__ import annotations
 
+from sart_toolkit.registry import lookup
 from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.tables import lookup
 
 ROBOTS = {
     "ur5e_2f85": "sart_toolkit.robots.ur5e_2f85:SPEC",

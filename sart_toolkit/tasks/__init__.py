@@ -5,7 +5,7 @@ A new task is one file and one line in `TASKS`.
 
 from __future__ import annotations
 
-from sart_toolkit.tables import lookup
+from sart_toolkit.registry import lookup
 from sart_toolkit.tasks.task import Task
 
 TASKS = {

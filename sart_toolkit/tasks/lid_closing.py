@@ -8,7 +8,7 @@ from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import inverse, pose
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.scene.spec import Body, Detent, Joint, SceneSpec, SceneState
+from sart_toolkit.scenes.spec import Body, Detent, Joint, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
 from sart_toolkit.tasks.task import Placement, Stage, Task
 

@@ -10,7 +10,7 @@ from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape, look_at
-from sart_toolkit.scene.spec import Body, Joint, SceneSpec, SceneState
+from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
 from sart_toolkit.tasks.task import Placement, Stage, Task
 

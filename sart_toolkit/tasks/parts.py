@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.robots.spec import CameraSpec, Shape, look_at
-from sart_toolkit.scene.spec import Body
+from sart_toolkit.scenes.spec import Body
 
 # Plain, with its edges out of every camera's view: only the task's object may locate the goal.
 TABLE = Body(

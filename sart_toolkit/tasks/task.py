@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sart_toolkit.backends.interface import Observation
+from sart_toolkit.data.records import RECORD_HZ
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, pose
-from sart_toolkit.records import RECORD_HZ
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.spec import SceneSpec, SceneState
+from sart_toolkit.scenes.spec import SceneSpec, SceneState
 
 
 @dataclass(frozen=True)

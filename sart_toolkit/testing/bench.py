@@ -16,15 +16,15 @@ import numpy as np
 
 from sart_toolkit.backends import BACKENDS
 from sart_toolkit.backends.interface import Backend, Contact, Observation
+from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
+from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.errors import InvalidInput, MissingCapability, MissingExtra
 from sart_toolkit.poses import Array, interpolate, inverse, pose
-from sart_toolkit.records import CONTROL_HZ
+from sart_toolkit.registry import lookup
 from sart_toolkit.robots import ROBOTS
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.scene.collision import coal_transform, convex_distance, robot_parts
-from sart_toolkit.scene.spec import SceneSpec, SceneState
-from sart_toolkit.tables import lookup
+from sart_toolkit.scenes.spec import SceneSpec, SceneState
 from sart_toolkit.testing.scenes import BLOCK_TOP, SCENES, STICK_TIP, ready_joints, site
 
 try:

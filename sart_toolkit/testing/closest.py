@@ -35,7 +35,7 @@ from sart_toolkit.errors import unknown_name
 from sart_toolkit.poses import Array, check_array, check_pose, inverse, rpy_pose
 from sart_toolkit.robots.spec import RobotSpec, Shape, check_gripper
 from sart_toolkit.robots.urdf import composed_urdf
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scenes.spec import SceneSpec
 
 # Configurations whose bounds are computed at once: as many as the processor's cache holds.
 _CHUNK = 32

@@ -16,7 +16,7 @@ from sart_toolkit.poses import Array, check_poses, exp_rotation, interpolate, in
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.scene.spec import Body, SceneSpec
+from sart_toolkit.scenes.spec import Body, SceneSpec
 from sart_toolkit.tasks.parts import TABLE, tool_down
 from sart_toolkit.testing.closest import collision_geometry, cover_spheres
 

@@ -9,7 +9,7 @@ import pytest
 from sart_toolkit.backends import BACKENDS
 from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import ROBOTS
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scenes.spec import SceneSpec
 from sart_toolkit.testing.bench import Bench, find_backend, make_bench
 
 Make = Callable[..., Bench]

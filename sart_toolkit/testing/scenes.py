@@ -10,7 +10,7 @@ import numpy as np
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, CameraSpec, RobotSpec, Shape, look_at
-from sart_toolkit.scene.spec import Body, Detent, Joint, SceneSpec
+from sart_toolkit.scenes.spec import Body, Detent, Joint, SceneSpec
 
 BLOCK_TOP = 0.04
 STICK_TIP = 0.06

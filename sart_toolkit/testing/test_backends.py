@@ -11,7 +11,7 @@ import pytest
 from sart_toolkit.backends.interface import Capabilities
 from sart_toolkit.errors import InvalidInput, MissingCapability, UnknownName
 from sart_toolkit.poses import Array, pose
-from sart_toolkit.scene.spec import Body, SceneSpec, SceneState
+from sart_toolkit.scenes.spec import Body, SceneSpec, SceneState
 from sart_toolkit.testing.bench import Bench, find_backend
 
 Make = Callable[..., Bench]

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.poses import angle_between, pose
-from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.robots.spec import mass_properties
-from sart_toolkit.scene.spec import Body, Joint
+from sart_toolkit.scenes.spec import Body, Joint
 from sart_toolkit.testing.bench import Bench
 from sart_toolkit.testing.scenes import (
     BRICK_HEIGHT,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sart_toolkit.backends.interface import Contact
+from sart_toolkit.collision.model import CollisionModel
 from sart_toolkit.poses import pose
-from sart_toolkit.scene.collision import CollisionModel
 from sart_toolkit.testing.bench import Bench
 from sart_toolkit.testing.scenes import BRICK_HEIGHT, PUSH_HEIGHT
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.poses import inverse
-from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.testing.bench import Bench
 from sart_toolkit.testing.scenes import GRASP_HEIGHT, GRASPED_WIDTH
 

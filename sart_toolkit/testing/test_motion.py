@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sart_toolkit.records import CONTROL_HZ
+from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.testing.bench import Bench
 
 # Where a joint may be [rad] when it is where it was commanded to.

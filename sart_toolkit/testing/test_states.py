@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.poses import angle_between, pose
-from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.scene.spec import Body, SceneSpec
+from sart_toolkit.scenes.spec import Body, SceneSpec
 from sart_toolkit.testing.bench import Bench, continue_in_new_process
 
 Make = Callable[..., Bench]

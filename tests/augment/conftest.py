@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sart_toolkit.records import Annotation, Demonstration, PrecisionSphere
+from sart_toolkit.data.records import Annotation, Demonstration, PrecisionSphere
 
 
 @pytest.fixture(scope="session")

@@ -15,9 +15,16 @@ import pytest
 from sart_toolkit.augment import engine
 from sart_toolkit.augment.config import SHARES, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.segments import KEPT, Attempt, SegmentMaker, SegmentPlanner
+from sart_toolkit.augment.execution import KEPT, Attempt, SegmentMaker, SegmentPlanner
 from sart_toolkit.augment.strategies import STRATEGIES
 from sart_toolkit.backends.interface import Backend, Capabilities, Contact
+from sart_toolkit.data.records import (
+    Annotation,
+    PrecisionSphere,
+    apply_action,
+    convergence_waypoint,
+)
+from sart_toolkit.data.storage import load_dataset
 from sart_toolkit.errors import (
     CannotWrite,
     InvalidInput,
@@ -28,13 +35,6 @@ from sart_toolkit.errors import (
     UnknownName,
 )
 from sart_toolkit.poses import interpolate, log_rotation, pose
-from sart_toolkit.records import (
-    Annotation,
-    PrecisionSphere,
-    apply_action,
-    convergence_waypoint,
-)
-from sart_toolkit.storage import load_dataset
 
 CROWDED = AugmentConfig(n=5, seed=3, duration=0.8)
 
@@ -482,16 +482,16 @@ from pathlib import Path
 from sart_toolkit.augment import engine
 from sart_toolkit.augment.config import SHARES, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.segments import KEPT, Attempt, SegmentMaker, SegmentPlanner
+from sart_toolkit.augment.execution import KEPT, Attempt, SegmentMaker, SegmentPlanner
 from sart_toolkit.backends import make_backend
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.scene.demonstrated import DemonstratedScene
-from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import record_demonstration
+from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 
 task = get_task("peg_in_hole")
 robot = get_robot(task.robot)

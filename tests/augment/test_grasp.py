@@ -6,20 +6,20 @@ import functools
 import numpy as np
 import pytest
 
+from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.segments import KEPT, SegmentMaker
+from sart_toolkit.augment.execution import KEPT, SegmentMaker
 from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.data.records import Annotation, PrecisionSphere, convergence_waypoint
+from sart_toolkit.data.storage import load_demonstration, save_demonstration
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.records import Annotation, PrecisionSphere, convergence_waypoint
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.demonstrated import DemonstratedScene
-from sart_toolkit.storage import load_demonstration, save_demonstration
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import record_demonstration
-from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 
 @pytest.fixture(scope="module")

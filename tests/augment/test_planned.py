@@ -17,19 +17,24 @@ from PIL import Image
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.segments import KEPT, SegmentMaker, SegmentPlanner
+from sart_toolkit.augment.execution import KEPT, SegmentMaker, SegmentPlanner
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import make_backend
+from sart_toolkit.collision.certificate import certify
+from sart_toolkit.data.records import (
+    Annotation,
+    PrecisionSphere,
+    apply_action,
+    convergence_waypoint,
+)
+from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import MotionRejected
 from sart_toolkit.poses import interpolate
-from sart_toolkit.records import Annotation, PrecisionSphere, apply_action, convergence_waypoint
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.sampling import SamplingConfig
-from sart_toolkit.scene.certificate import certify
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
 
 _PATH = Path(__file__).parents[2] / "tools" / "planned_picture.py"
 _SPEC = importlib.util.spec_from_file_location("planned_picture", _PATH)

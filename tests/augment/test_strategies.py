@@ -11,10 +11,10 @@ from scipy import stats
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.strategies import STRATEGIES, get_strategy, sart, sart_planned
+from sart_toolkit.data.records import Demonstration, PrecisionSphere, Steps, convergence_waypoint
+from sart_toolkit.data.sampling import LAWS, SamplingConfig, sample_direction, sample_rotation
 from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
 from sart_toolkit.poses import angle_between, log_rotation, pose
-from sart_toolkit.records import Demonstration, PrecisionSphere, Steps, convergence_waypoint
-from sart_toolkit.sampling import LAWS, SamplingConfig, sample_direction, sample_rotation
 
 N = 20_000
 some = settings(max_examples=100, deadline=None, derandomize=True)

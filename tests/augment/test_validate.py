@@ -11,9 +11,9 @@ import pytest
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.validate import validate_dataset
+from sart_toolkit.data.records import Steps
+from sart_toolkit.data.storage import load_dataset, load_episode, save_episode
 from sart_toolkit.errors import BrokenFile, Mismatch, MissingFile
-from sart_toolkit.records import Steps
-from sart_toolkit.storage import load_dataset, load_episode, save_episode
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import pytest
 
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Observation
+from sart_toolkit.data.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.errors import MissingExtra, UnknownName
-from sart_toolkit.records import CONTROL_HZ, PHYSICS_HZ
 from sart_toolkit.robots import get_robot
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scenes.spec import SceneSpec
 from sart_toolkit.testing.bench import find_backend, make_bench
 
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from sart_toolkit.backends import make_backend
+from sart_toolkit.collision.model import primitive
+from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.errors import CannotWrite, InvalidInput, MissingCapability, SartError
 from sart_toolkit.poses import distance, interpolate, pose
-from sart_toolkit.records import CONTROL_HZ
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, look_at
-from sart_toolkit.scene.collision import primitive
-from sart_toolkit.scene.spec import Body, Detent, Joint, Light, SceneSpec
+from sart_toolkit.scenes.spec import Body, Detent, Joint, Light, SceneSpec
 from sart_toolkit.workers import worker_map
 
 pytest.importorskip("sapien")
@@ -443,7 +443,7 @@ import numpy as np
 from sart_toolkit.backends import make_backend
 from sart_toolkit.errors import MissingCapability
 from sart_toolkit.robots import get_robot
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scenes.spec import SceneSpec
 robot = get_robot("ur5e_hande")
 backend = make_backend("sapien", robot, SceneSpec(()), 16)
 assert not backend.capabilities.renders and type(backend).capabilities.renders

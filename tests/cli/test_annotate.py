@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from sart_toolkit.cli import main
-from sart_toolkit.records import Demonstration
-from sart_toolkit.storage import (
+from sart_toolkit.data.records import Demonstration
+from sart_toolkit.data.storage import (
     load_annotation,
     load_demonstration,
     save_annotation,

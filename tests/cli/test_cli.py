@@ -13,9 +13,9 @@ import pytest
 
 from sart_toolkit.backends import BACKENDS
 from sart_toolkit.cli import main
+from sart_toolkit.data.storage import load_demonstration
 from sart_toolkit.doctor import Finding
-from sart_toolkit.evaluate.report import write_report
-from sart_toolkit.storage import load_demonstration
+from sart_toolkit.report.page import write_report
 from sart_toolkit.tasks import TASKS
 
 

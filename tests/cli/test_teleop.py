@@ -13,13 +13,13 @@ import pytest
 from sart_toolkit.backends.interface import Capabilities
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.cli import main
-from sart_toolkit.errors import CannotWrite
-from sart_toolkit.storage import (
+from sart_toolkit.data.storage import (
     load_demonstration,
     read_json_lines,
     save_demonstration,
     save_episode,
 )
+from sart_toolkit.errors import CannotWrite
 from sart_toolkit.testing.desktop import Desktop, check_desktop
 
 SART = (sys.executable, "-c", "from sart_toolkit.cli import main; main()")
@@ -87,7 +87,7 @@ def test_without_a_display_the_remedy_is_told_and_nothing_written(tmp_path, caps
 def test_a_person_s_recording_short_of_the_goal_is_saved_when_asked_twice(
     tmp_path, capsys, dummy, monkeypatch
 ):
-    monkeypatch.setattr("sart_toolkit.teach.window._SAVED_SHOWN", 0.0)
+    monkeypatch.setattr("sart_toolkit.record.window._SAVED_SHOWN", 0.0)
     dummy("right", "right", "right", "right")
     out = tmp_path / "d.h5"
     said = result(capsys, *RECORD, out, *BY_HAND, "--operator", "Ada")
@@ -104,7 +104,7 @@ def test_a_discarded_recording_writes_nothing_and_says_so(tmp_path, capsys, dumm
 
 
 def test_a_disk_that_is_full_at_first_costs_nothing(tmp_path, capsys, dummy, monkeypatch):
-    monkeypatch.setattr("sart_toolkit.teach.window._SAVED_SHOWN", 0.0)
+    monkeypatch.setattr("sart_toolkit.record.window._SAVED_SHOWN", 0.0)
     tries = []
 
     def save(path, demonstration):

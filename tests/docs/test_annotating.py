@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sart_toolkit.teach.annotation import ACTIONS
+from sart_toolkit.annotate.session import ACTIONS
 
 PAGE = Path(__file__).parents[2] / "docs" / "annotating.md"
 

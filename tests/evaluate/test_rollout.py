@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from sart_toolkit.data.records import RECORD_HZ
+from sart_toolkit.data.storage import read_json
 from sart_toolkit.errors import CannotWrite, InvalidInput, MissingFile, SartError
 from sart_toolkit.evaluate import rollout as module
 from sart_toolkit.evaluate.rollout import (
@@ -20,8 +22,6 @@ from sart_toolkit.evaluate.rollout import (
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.learn.skill import save_skill
 from sart_toolkit.learn.training import TrainConfig, train
-from sart_toolkit.records import RECORD_HZ
-from sart_toolkit.storage import read_json
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
 

@@ -8,9 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sart_toolkit.learn.training import TrainConfig
-from sart_toolkit.poses import pose
-from sart_toolkit.records import (
+from sart_toolkit.data.records import (
     Annotation,
     CameraRecord,
     Dataset,
@@ -20,6 +18,8 @@ from sart_toolkit.records import (
     Provenance,
     Steps,
 )
+from sart_toolkit.learn.training import TrainConfig
+from sart_toolkit.poses import pose
 
 # Blob at (u, v) in [-1, 1]: the next command moves by this much of it [m].
 GAIN = 0.01

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from sart_toolkit import storage
+from sart_toolkit.data import storage
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, OutputExists
+from sart_toolkit.learn.samples import build_windows
 from sart_toolkit.learn.skill import Skill, SkillConfig, load_skill, save_skill
 from sart_toolkit.learn.training import CHECKPOINT, train
-from sart_toolkit.learn.windows import build_windows
 
 
 @pytest.fixture

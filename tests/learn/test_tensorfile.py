@@ -4,9 +4,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from sart_toolkit.data.storage import SCHEMA_VERSION
 from sart_toolkit.errors import BrokenFile, CannotWrite, MissingFile
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
-from sart_toolkit.storage import SCHEMA_VERSION
 
 
 def test_tensors_and_header_survive_whatever_their_layout(tmp_path):

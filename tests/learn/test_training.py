@@ -10,6 +10,7 @@ from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, SartError, 
 from sart_toolkit.learn import training
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.learn.policies.resnet18_mlp import ResNet18
+from sart_toolkit.learn.samples import build_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.training import (
     CHECKPOINT,
@@ -19,7 +20,6 @@ from sart_toolkit.learn.training import (
     resolve_device,
     train,
 )
-from sart_toolkit.learn.windows import build_windows
 
 
 def _same_weights(a, b):

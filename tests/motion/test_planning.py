@@ -12,6 +12,8 @@ import sys
 import numpy as np
 import pytest
 
+from sart_toolkit.collision.certificate import certify
+from sart_toolkit.collision.model import CollisionModel, PlacedModel
 from sart_toolkit.errors import InvalidInput, MissingExtra, MotionRejected, Unreachable
 from sart_toolkit.motion import planning
 from sart_toolkit.motion.path import PolylinePath
@@ -19,9 +21,7 @@ from sart_toolkit.motion.planning import PlanConfig, check_planner, plan_motion,
 from sart_toolkit.poses import distance, pose
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.spec import Attachment, Shape
-from sart_toolkit.scene.certificate import certify
-from sart_toolkit.scene.collision import CollisionModel, PlacedModel
-from sart_toolkit.scene.spec import Body, SceneSpec
+from sart_toolkit.scenes.spec import Body, SceneSpec
 from sart_toolkit.tasks.parts import TABLE, tool_down
 
 MARGIN = 0.001

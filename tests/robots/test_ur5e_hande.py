@@ -7,7 +7,7 @@ from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.poses import inverse
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scenes.spec import SceneSpec
 
 SPEC = get_robot("ur5e_hande")
 COMMANDS = np.linspace(0, 1, 11)

@@ -9,12 +9,12 @@ import pytest
 
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.records import Demonstration
+from sart_toolkit.data.records import Demonstration
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks.task import Stage
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
 
 
 @pytest.fixture(scope="module")

@@ -10,20 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.model import CollisionModel
+from sart_toolkit.data.records import RECORD_HZ
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import inverse
-from sart_toolkit.records import RECORD_HZ
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.scene.collision import CollisionModel
-from sart_toolkit.scene.demonstrated import DemonstratedScene
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.teach.scripted import ScriptedOperator
-from sart_toolkit.teach.session import SessionConfig, record_demonstration
-from sart_toolkit.teach.suggest import ExactSurroundings, suggest_annotation
 
 
 @pytest.fixture(scope="module", params=TASKS)

@@ -14,7 +14,7 @@ from sart_toolkit.backends.states import pack_state, unpack_state
 from sart_toolkit.errors import MissingCapability
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.spec import CameraSpec, RobotSpec
-from sart_toolkit.scene.spec import Joint, SceneSpec, SceneState
+from sart_toolkit.scenes.spec import Joint, SceneSpec, SceneState
 
 # --- pictures -----------------------------------------------------------------------------------
 

@@ -12,13 +12,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import exp_rotation, inverse, pose
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.scene.collision import coal_transform, convex_distance, robot_parts
-from sart_toolkit.scene.spec import Body, Joint, SceneSpec
+from sart_toolkit.scenes.spec import Body, Joint, SceneSpec
 from sart_toolkit.testing import closest, clutter
 from sart_toolkit.testing.closest import ClosestPoints, cover_spheres
 from sart_toolkit.testing.clutter import CLUTTER

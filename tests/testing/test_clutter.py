@@ -14,7 +14,7 @@ from sart_toolkit.motion.line import straight_line
 from sart_toolkit.poses import distance, interpolate, inverse
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scenes.spec import SceneSpec
 from sart_toolkit.tasks.parts import TABLE
 from sart_toolkit.testing import clutter
 from sart_toolkit.testing.closest import ClosestPoints

@@ -9,7 +9,7 @@ import pytest
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import ROBOTS, get_robot
-from sart_toolkit.scene.spec import SceneSpec
+from sart_toolkit.scenes.spec import SceneSpec
 
 
 def _told(outcome):

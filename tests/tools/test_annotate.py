@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sart_toolkit.storage import load_annotation, save_demonstration
+from sart_toolkit.data.storage import load_annotation, save_demonstration
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

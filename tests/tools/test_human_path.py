@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from sart_toolkit.storage import load_annotation, load_demonstration, save_demonstration
+from sart_toolkit.data.storage import load_annotation, load_demonstration, save_demonstration
 from sart_toolkit.testing.desktop import check_desktop
 
 _PATH = Path(__file__).parents[2] / "tools" / "human_path.py"
@@ -29,7 +29,7 @@ def test_a_demonstration_is_recorded_by_keys_alone_in_the_real_window(tmp_path, 
         with Image.open(tmp_path / "pictures" / f"record_{phase}.png") as picture:
             assert picture.size == (1280, 800)
     rows = [json.loads(line) for line in (tmp_path / "status.jsonl").read_text().splitlines()]
-    assert [rows[0]["phase"], rows[-1]["phase"]] == ["ready", "saved"]
+    assert [rows[0]["state"], rows[-1]["state"]] == ["ready", "saved"]
 
 
 @pytest.mark.window

@@ -6,7 +6,7 @@ A new policy is one file with an `Encoder` and one line in `POLICIES`.
 from __future__ import annotations
 
 from sart_toolkit.learn.policies.encoder import Encoder
-from sart_toolkit.tables import lookup
+from sart_toolkit.registry import lookup
 
 POLICIES = {
     "compact_mlp": "sart_toolkit.learn.policies.compact_mlp:CompactEncoder",

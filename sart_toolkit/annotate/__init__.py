@@ -1,0 +1,1 @@
+"""Precision spheres: suggested from the scene, and set by a person."""

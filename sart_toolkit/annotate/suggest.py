@@ -1,0 +1,567 @@
+"""Radii from the scene's geometry instead of from a person's eye."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.stats import qmc
+
+from sart_toolkit.collision.demonstrated import DemonstratedScene, Phase
+from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.data.records import (
+    ROTATION_PER_METRE,
+    Annotation,
+    Demonstration,
+    PrecisionSphere,
+    convergence_waypoint,
+)
+from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
+from sart_toolkit.poses import Array, check_positive, distance, pose
+from sart_toolkit.robots.model import RobotModel
+
+_BISECTIONS = 40
+_SHRINK = 0.9
+# A pose is within reach if no joint is nearer to its limit than this [rad], and the Jacobian's
+# smallest singular value (metres and radians alike) no less: elsewhere small motions of the tool
+# take large ones of the joints.
+_JOINT_MARGIN = 0.05
+_LEAST_SINGULAR_VALUE = 0.03
+_LARGEST_STEP = 1.5
+# What moves no farther than this in 0.2 s stands still [m, deg].
+_STILL, _STILL_DEG = 0.0005, 0.2
+# Pairs without a proof keep this [m] more at the draws that are aimed at them.
+_ARM_MARGIN = 0.005
+# By this many radii, at most, two bodies come nearer within a sphere; by half that usually.
+_STEEPEST = 5.0
+# A sphere of this radius [m] or more is probed in full, the smallest at a quarter of the poses.
+_WIDE, _FEWEST_PROBES = 0.06, 0.25
+
+
+@dataclass(frozen=True)
+class SuggestConfig:
+    """How radii are suggested.
+
+    `margin` [m] stays free everywhere; no radius is below `min_radius` or above `max_radius` [m];
+    `rotation_per_metre` [rad/m] is the augmentation's nu_r; `probes` is the number of poses at
+    which the whole robot is tried in a wide sphere.
+    """
+
+    margin: float = 0.0005
+    min_radius: float = 0.004
+    max_radius: float = 0.15
+    rotation_per_metre: float = ROTATION_PER_METRE
+    probes: int = 24
+
+    def __post_init__(self) -> None:
+        for name in ("margin", "min_radius", "max_radius"):
+            check_positive(name, getattr(self, name), "m")
+        if not (np.isfinite(self.rotation_per_metre) and self.rotation_per_metre >= 0):
+            raise InvalidInput(
+                f"rotation_per_metre: expected a finite number >= 0, got {self.rotation_per_metre}"
+            )
+        if self.max_radius < self.min_radius:
+            raise InvalidInput(
+                f"max_radius {self.max_radius} m is below min_radius {self.min_radius} m"
+            )
+        if self.probes < 1:
+            raise InvalidInput(f"probes: expected at least 1, got {self.probes}")
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A suggested radius [m] (0: no room), the clearance behind it, and what limits it.
+
+    `clearance` [m] is that of the pair of bodies that bounds the radius, or of the nearest pair
+    where something else does; `None` where it was not needed: the demonstration's phase leaves no
+    room.
+    """
+
+    radius: float
+    clearance: float | None
+    limited_by: str
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A convex part of the tool and a convex obstacle, their names and distance [m].
+
+    `normal (3,)`: the unit vector from the obstacle's nearest point to the part's, world frame.
+    `points (n, 3)`: points whose hull encloses the part, from the tool frame's origin, world axes;
+    `support`: how far [m] the obstacle reaches along the normal, from the same origin.
+    """
+
+    part: str
+    obstacle: str
+    distance: float
+    normal: Array
+    points: Array
+    support: float
+
+    def fits(self, radius: float, margin: float, rotation_per_metre: float) -> bool:
+        """Whether the part keeps `margin` [m] at every pose within `radius` and nu radius.
+
+        One of two proofs is enough. No point moves farther than r + 2 rho sin(nu r / 2), rho being
+        the farthest point's distance from the tool's origin (shared/reference, section 4). And the
+        plane across the gap still separates the two if no point x, turned towards it by up to nu r
+        and moved by up to r, comes nearer than the margin:
+        |x| cos(alpha + nu r) - r >= support + margin, alpha being the angle from x to the normal.
+        """
+        return self._distance_fits(radius, margin, rotation_per_metre) or self._plane_fits(
+            radius, margin, rotation_per_metre
+        )
+
+    def limited(self, best: Suggestion, config: SuggestConfig) -> Suggestion:
+        """`best`, or less where this gap allows only that."""
+        if self.fits(best.radius, config.margin, config.rotation_per_metre):
+            return best
+        r = certified_radius(self, config.margin, config.rotation_per_metre, best.radius)
+        return Suggestion(r, self.distance, f"{self.part} / {self.obstacle}")
+
+    def _distance_fits(self, radius: float, margin: float, nu: float) -> bool:
+        swing = 2 * self._reach * np.sin(min(nu * radius, np.pi) / 2)
+        return bool(radius + swing + margin <= self.distance)
+
+    def _plane_fits(self, radius: float, margin: float, nu: float) -> bool:
+        lengths, angles = self._polar
+        lowest = lengths * np.cos(np.minimum(angles + nu * radius, np.pi))
+        return bool(lowest.min() - radius >= self.support + margin)
+
+    @functools.cached_property
+    def _reach(self) -> float:
+        return float(np.linalg.norm(self.points, axis=1).max())
+
+    @functools.cached_property
+    def _polar(self) -> tuple[Array, Array]:
+        """Each point's distance from the tool's origin [m] and angle [rad] from the normal."""
+        along = self.points @ self.normal
+        lengths = np.linalg.norm(self.points, axis=1)
+        across = np.sqrt(np.maximum(lengths**2 - along**2, 0.0))
+        return lengths, np.arctan2(across, along)
+
+
+def certified_radius(gap: Gap, margin: float, rotation_per_metre: float, largest: float) -> float:
+    """The largest r [m] for which a tool part is proved clear at every pose drawn within r.
+
+    Args:
+        gap: part and obstacle at the waypoint.
+        margin: distance [m] that stays free.
+        rotation_per_metre: nu [rad/m].
+        largest: upper bound [m] of the answer.
+    """
+    if not gap.fits(0.0, margin, rotation_per_metre):
+        return 0.0
+    if gap.fits(largest, margin, rotation_per_metre):
+        return largest
+    low, high = 0.0, largest
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        if gap.fits(middle, margin, rotation_per_metre):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+class Surroundings(Protocol):
+    """What radii are suggested from: where obstacles are at each waypoint, however it is known.
+
+    Attributes:
+        kinematics: the robot.
+        phases: the phase of each waypoint.
+    """
+
+    kinematics: RobotModel
+    phases: tuple[Phase, ...]
+
+    def placed(self, t: int) -> PlacedModel:
+        """The robot, and what else of the scene is known exactly, as at waypoint `t`."""
+
+    def proved(self, t: int, config: SuggestConfig) -> Suggestion:
+        """The largest radius about waypoint `t` for which the tool is proved clear of obstacles."""
+
+    def too_close(self, t: int, q: Array, margin: float) -> str | None:
+        """The names of a pair of the whole robot, the scene as at `t`, nearer than the margin."""
+
+    def moving(self, t: int) -> str | None:
+        """The name of an obstacle that doesn't stand still at waypoint `t`."""
+
+
+class ExactSurroundings:
+    """Obstacles as the simulated scene has them."""
+
+    def __init__(self, scene: DemonstratedScene) -> None:
+        """Take the scene's bodies from where the demonstration has them."""
+        self._scene = scene
+        self.kinematics = scene.collision.kinematics
+        self.phases = scene.phases
+
+    def placed(self, t: int) -> PlacedModel:
+        """Robot and scene as at waypoint `t`."""
+        return self._scene.placed(t)
+
+    def gaps(self, t: int) -> Iterator[Gap]:
+        """Tool parts and obstacles at waypoint `t`, nearest first."""
+        placed = self._scene.placed(t)
+        q = self._scene.demonstration.steps.joint_positions[t]
+        pairs = placed.tool_pairs()
+        distances = np.array(placed.pair_distances(q, pairs))
+        T_joint = placed.joint_poses(q)[-1]
+        p_tool = (T_joint @ placed.T_joint_tool)[:3, 3]
+        for i in np.argsort(distances, kind="stable"):
+            found = placed.witness(q, pairs[i])
+            part = placed.parts[placed.pairs[pairs[i]][0]]
+            normal = found.p_a - found.p_b
+            length = float(np.linalg.norm(normal))
+            # Bodies that touch have no plane between them; nothing fits then.
+            normal = normal / length if length > 1e-9 else np.zeros(3)
+            points = part.points @ T_joint[:3, :3].T + T_joint[:3, 3] - p_tool
+            support = float(normal @ (found.p_b - p_tool)) + float(placed.play[pairs[i]])
+            yield Gap(found.a, found.b, found.distance, normal, points, support)
+
+    def proved(self, t: int, config: SuggestConfig) -> Suggestion:
+        """The largest radius about waypoint `t` for which the tool is proved clear of obstacles."""
+        placed, nu = self._scene.placed(t), config.rotation_per_metre
+        last = len(self.kinematics.spec.arm_joints)
+        tool = [part.points for part in placed.parts if part.joint == last]
+        p_tool = placed.T_joint_tool[:3, 3]
+        reach = float(np.linalg.norm(np.concatenate(tool) - p_tool, axis=1).max())
+        best = Suggestion(config.max_radius, None, "max_radius")
+        for gap in self.gaps(t):
+            if best.clearance is None:
+                best = dataclasses.replace(best, clearance=gap.distance)
+            # No point of the tool comes as far as the pairs from here on.
+            swept = best.radius + 2 * reach * np.sin(min(nu * best.radius, np.pi) / 2)
+            if gap.distance >= swept + config.margin:
+                break
+            best = gap.limited(best, config)
+        return best
+
+    def too_close(self, t: int, q: Array, margin: float) -> str | None:
+        """The names of a pair of the whole robot, the scene as at `t`, nearer than the margin."""
+        pair = self._scene.placed(t).too_close(q, margin)
+        return None if pair is None else " / ".join(pair)
+
+    def moving(self, t: int) -> str | None:
+        """The name of a body that doesn't stand still at waypoint `t`; a carried one may move."""
+        bodies = self._scene.demonstration.body_Ts_world
+        before, after = max(t - 1, 0), min(t + 1, len(self.phases) - 1)
+        for name, Ts in bodies.items():
+            if name in self.phases[t].carried or name in self._held:
+                continue
+            far, turn = distance(Ts[before], Ts[after])
+            if far > _STILL or turn > np.deg2rad(_STILL_DEG):
+                return name
+        return None
+
+    @functools.cached_property
+    def _held(self) -> frozenset[str]:
+        return frozenset(body.name for body in self._scene.collision.scene.held)
+
+
+def suggest_radius(
+    surroundings: Surroundings,
+    demonstration: Demonstration,
+    t: int,
+    config: SuggestConfig | None = None,
+) -> Suggestion:
+    """The largest radius around waypoint `t` that keeps the robot clear.
+
+    Tool bodies are proved clear of the scene for every pose that can be drawn. The whole robot, its
+    reach, and the waypoint that a segment of this radius starts from are tried, the robot at
+    `probes` extreme poses, and the radius shrunk until all pass.
+
+    Args:
+        surroundings: where the obstacles are.
+        demonstration: what was shown.
+        t: the key waypoint.
+        config: margins and limits.
+
+    Raises:
+        InvalidInput: no such waypoint.
+    """
+    config = config or SuggestConfig()
+    if not 0 <= t < len(demonstration) - 1:
+        raise InvalidInput(f"waypoint {t}: expected 0 to {len(demonstration) - 2}; choose another")
+    room = _room_before_event(demonstration, surroundings.phases, t)
+    if room is not None and room.radius < config.min_radius:
+        return room
+    moving = surroundings.moving(t)
+    if moving is not None:
+        return Suggestion(0.0, None, f"{moving} moves")
+    best = surroundings.proved(t, config)
+    if room is not None and room.radius < best.radius:
+        best = dataclasses.replace(room, clearance=best.clearance)
+    if best.radius < config.min_radius:
+        return dataclasses.replace(best, radius=0.0)
+    q_key = demonstration.steps.joint_positions[t]
+    threats = _threats(surroundings.placed(t), q_key, _STEEPEST * best.radius + _ARM_MARGIN)
+    while best.radius >= config.min_radius:
+        problem = _probe(surroundings, demonstration, t, best.radius, config, threats)
+        if problem is None:
+            return best
+        best = Suggestion(best.radius * _SHRINK, best.clearance, problem)
+    return Suggestion(0.0, best.clearance, best.limited_by)
+
+
+def _probe(
+    surroundings: Surroundings,
+    demonstration: Demonstration,
+    t: int,
+    radius: float,
+    config: SuggestConfig,
+    threats: Sequence[_Threat],
+) -> str | None:
+    """What goes wrong at one of the extreme poses of a radius, or at its t*; or None."""
+    steps, model = demonstration.steps, surroundings.kinematics
+    T_key, q_key = steps.measured_Ts_world_tool[t], steps.joint_positions[t]
+    t_star = convergence_waypoint(demonstration, PrecisionSphere(t, T_key, radius))
+    moving = surroundings.moving(t_star)
+    if moving is not None:
+        return f"{moving} moves at waypoint {t_star}"
+    pair = surroundings.too_close(t_star, steps.commanded_joint_positions[t_star], config.margin)
+    if pair is not None:
+        return f"{pair} at waypoint {t_star}"
+    reached = functools.partial(_reached, model, T_key, q_key, radius, config)
+    problem = _directed(surroundings.placed(t), threats, q_key, radius, config, reached)
+    if problem is not None:
+        return problem
+    # The arm hardly moves in a small sphere.
+    count = int(np.ceil(config.probes * min(1.0, max(radius / _WIDE, _FEWEST_PROBES))))
+    for direction, axis in _directions(count):
+        q = reached(direction, axis)
+        if isinstance(q, str):
+            return q
+        pair = surroundings.too_close(t, q, config.margin)
+        if pair is not None:
+            return pair
+    return None
+
+
+def _reached(
+    model: RobotModel,
+    T_key: Array,
+    q_key: Array,
+    radius: float,
+    config: SuggestConfig,
+    direction: Array,
+    axis: Array,
+) -> Array | str:
+    """Joints `(n,)` for the extreme pose in a direction, turned about an axis; or what forbids it.
+
+    `direction (3,)` is in the world, `axis (3,)` in the tool frame; both are unit vectors.
+    """
+    T = T_key @ pose(rotvec=config.rotation_per_metre * radius * axis)
+    T[:3, 3] = T_key[:3, 3] + radius * direction
+    try:
+        q = model.ik(T, q_key, _LARGEST_STEP)
+    except (Unreachable, MotionRejected):
+        return "reach"
+    if min((q - model.lower).min(), (model.upper - q).min()) < _JOINT_MARGIN:
+        return "joint limit"
+    if np.linalg.svd(model.jacobian(q), compute_uv=False)[-1] < _LEAST_SINGULAR_VALUE:
+        return "singularity"
+    return q
+
+
+@dataclass(frozen=True)
+class _Threat:
+    """Two bodies without a proof: their nearest pair by index, how the tool's motion changes it.
+
+    `distance` [m] is that at the waypoint, `slope (6,)` its gradient by the tool's motion (linear,
+    then turning [m/rad]) in the tool frame.
+    """
+
+    names: tuple[str, str]
+    pair: int
+    distance: float
+    slope: Array
+
+    @functools.cached_property
+    def straight(self) -> float:
+        """The greatest slope by moving, metres a metre."""
+        return float(np.linalg.norm(self.slope[:3]))
+
+    @functools.cached_property
+    def turning(self) -> float:
+        """The greatest slope by turning [m/rad]."""
+        return float(np.linalg.norm(self.slope[3:]))
+
+    @staticmethod
+    def of(placed: PlacedModel, pair: int, distance: float, q: Array) -> _Threat:
+        # The tool's motion is J dq.
+        slope = np.linalg.solve(placed.kinematics.jacobian(q).T, placed.gradient(q, pair))
+        return _Threat(placed.names(pair), pair, distance, np.asarray(slope, dtype=np.float64))
+
+
+def _threats(placed: PlacedModel, q_key: Array, within: float) -> list[_Threat]:
+    """Every two bodies `within` [m] that have no proof, arm against arm, say, as at a waypoint."""
+    proved = set(placed.tool_pairs())
+    unproved = [k for k in range(len(placed.pairs)) if k not in proved]
+    distances = dict(zip(unproved, placed.pair_distances(q_key, unproved), strict=True))
+    nearest: dict[tuple[str, str], int] = {}
+    for k in sorted(unproved, key=lambda k: distances[k], reverse=True):
+        nearest[placed.names(k)] = k
+    near = [k for k in nearest.values() if distances[k] <= within]
+    return [_Threat.of(placed, k, distances[k], q_key) for k in near]
+
+
+def _directed(
+    placed: PlacedModel,
+    threats: Sequence[_Threat],
+    q_key: Array,
+    radius: float,
+    config: SuggestConfig,
+    reached: Callable[[Array, Array], Array | str],
+) -> str | None:
+    """The names of a pair that a draw aimed at it brings too close; None if there is none.
+
+    Tried are the draw that brings a pair nearest by its distance's gradient at the waypoint, and,
+    where that came half the way, the one that does so by the gradient found there.
+    """
+    angle = config.rotation_per_metre * radius
+
+    def approach(threat: _Threat) -> float:
+        """By how much [m] the pair comes nearer within the sphere, by its slope."""
+        return threat.straight * radius + threat.turning * angle
+
+    # The likeliest first: a radius that is too large is then soon found to be.
+    for threat in sorted(threats, key=lambda threat: threat.distance - approach(threat)):
+        aimed, q = threat, q_key
+        for _ in range(2):
+            # Nowhere near, even if it all got twice as steep.
+            if threat.distance > 2 * approach(aimed) + _ARM_MARGIN:
+                break
+            R = placed.kinematics.fk(q)[:3, :3]
+            found = reached(
+                -R @ aimed.slope[:3] / max(aimed.straight, 1e-12),
+                -aimed.slope[3:] / max(aimed.turning, 1e-12),
+            )
+            if isinstance(found, str):
+                # What can't be reached can't collide.
+                break
+            q = found
+            distance = placed.pair_distances(q, [threat.pair])[0]
+            if distance < config.margin + _ARM_MARGIN:
+                return " / ".join(threat.names)
+            if distance > threat.distance / 2:
+                break
+            aimed = _Threat.of(placed, threat.pair, threat.distance, q)
+    return None
+
+
+@functools.cache
+def _directions(count: int) -> list[tuple[Array, Array]]:
+    """Pairs of unit vectors `(3,)` spread evenly: direction of the offset, axis of the turn."""
+    # Halton points of the four-dimensional square.
+    points = qmc.Halton(4, scramble=False).random(count)
+    return list(zip(_sphere_points(points[:, :2]), _sphere_points(points[:, 2:]), strict=True))
+
+
+def _sphere_points(uv: Array) -> Array:
+    """Unit vectors `(n, 3)`, area-uniform for uniform `uv (n, 2)`."""
+    z, psi = 1 - 2 * uv[:, 0], 2 * np.pi * uv[:, 1]
+    flat = np.sqrt(np.maximum(0.0, 1 - z**2))
+    return np.stack([flat * np.cos(psi), flat * np.sin(psi), z], axis=1)
+
+
+def _room_before_event(
+    demonstration: Demonstration, phases: Sequence[Phase], t: int
+) -> Suggestion | None:
+    """The largest radius that the demonstration leaves before its phase ends; None if it doesn't.
+
+    In a contact there is no room at all.
+    """
+    if phases[t].contacts:
+        return Suggestion(0.0, None, "contact " + " / ".join(min(phases[t].contacts)))
+    event = next((s for s in range(t, len(phases)) if phases[s] != phases[t]), None)
+    if event is None:
+        return None
+    p = demonstration.steps.measured_Ts_world_tool[t:event, :3, 3]
+    farthest = float(np.linalg.norm(p - p[0], axis=1).max())
+    what = phases[t].change(phases[event])
+    # A waypoint must lie outside of the sphere: a micrometre is left for that.
+    return Suggestion(max(0.0, farthest - 1e-6), None, f"{what} at waypoint {event}")
+
+
+def suggest_annotation(
+    demonstration: Demonstration,
+    surroundings: Surroundings,
+    waypoints: Sequence[int] | None = None,
+    config: SuggestConfig | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Annotation:
+    """Precision spheres for a demonstration, their radii from its surroundings.
+
+    Without `waypoints`, spheres tile the free part: the first at the start, each next one at the
+    convergence waypoint of the one before, or at the first later waypoint with room for
+    `min_radius`. A sphere is no larger than lets the tool rejoin the demonstration before the next
+    grasp, release or contact; an object in the grasp counts as part of the tool.
+
+    Args:
+        demonstration: what was shown.
+        surroundings: where the obstacles were.
+        waypoints: key waypoints, or `None` to choose them.
+        config: margins and limits.
+        progress: called with the waypoint reached.
+
+    Raises:
+        InvalidInput: a waypoint is out of range or has no room, or no waypoint has room.
+    """
+    config = config or SuggestConfig()
+    last = len(demonstration) - 1
+
+    def sphere_at(t: int) -> tuple[Suggestion, PrecisionSphere | None]:
+        found = suggest_radius(surroundings, demonstration, t, config)
+        if progress is not None:
+            progress(t)
+        if found.radius < config.min_radius:
+            return found, None
+        # Whole micrometres, rounded down: coal's last digits depend on what it computed before.
+        radius, clearance = (
+            None if x is None else float(np.floor(x * 1e6) / 1e6)
+            for x in (found.radius, found.clearance)
+        )
+        assert radius is not None
+        T_key = demonstration.steps.measured_Ts_world_tool[t]
+        return found, PrecisionSphere(
+            t, T_key, radius, "ball", "suggested", clearance, found.limited_by
+        )
+
+    spheres = []
+    if waypoints is not None:
+        for t in sorted(set(waypoints)):
+            found, sphere = sphere_at(t)
+            if sphere is None:
+                reason = found.limited_by
+                if found.clearance is not None:
+                    reason += f", clearance {found.clearance * 1e3:.1f} mm"
+                raise InvalidInput(
+                    f"waypoint {t}: no room for a sphere of {config.min_radius * 1e3:.1f} mm "
+                    f"({reason}); choose another"
+                )
+            spheres.append(sphere)
+    else:
+        t = 0
+        while t < last:
+            _, sphere = sphere_at(t)
+            if sphere is None:
+                t += 1
+                continue
+            spheres.append(sphere)
+            ahead = convergence_waypoint(demonstration, sphere)
+            if ahead >= last:
+                break
+            t = ahead
+    if not spheres:
+        raise InvalidInput(
+            f"no waypoint has room for a sphere of {config.min_radius * 1e3:.1f} mm; start the "
+            "demonstration farther from the scene, or lower min_radius"
+        )
+    return Annotation(
+        tuple(spheres), demonstration.content_hash(), settings=dataclasses.asdict(config)
+    )

@@ -1,0 +1,588 @@
+"""One collision model of robot and scene: convex parts on Pinocchio's joints, distances by coal."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from sart_toolkit.errors import InvalidInput, unknown_name
+from sart_toolkit.poses import Array, check_pose, frozen, inverse
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec, Shape
+from sart_toolkit.scenes.spec import SceneSpec
+
+Index = NDArray[np.intp]
+# Links of joints nearer to each other than this meet in the joints between them.
+_JOINTS_APART = 2
+# coal's own 1e-6 is relative to the distance, and lets normals be off by a milliradian.
+_TOLERANCE = 1e-8
+_YZX, _ZXY = [1, 2, 0], [2, 0, 1]
+
+
+@dataclass(frozen=True)
+class PairDistance:
+    """Distance [m] between two bodies, by name; negative where they overlap.
+
+    `p_a`, `p_b (3,)` are the witness points in the world: the nearest, or where they overlap the
+    deepest, point of each.
+    """
+
+    a: str
+    b: str
+    distance: float
+    p_a: Array
+    p_b: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "p_a", frozen(self.p_a))
+        object.__setattr__(self, "p_b", frozen(self.p_b))
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """The two names."""
+        return self.a, self.b
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexPart:
+    """A convex part of a body: its geometry and its pose `T_joint_part (4, 4)` on joint `joint`.
+
+    `joint` counts the arm's joints from 1; what no joint moves is on joint 0, the world. The hull
+    of `points (n, 3)`, in the joint's frame, encloses the part.
+    """
+
+    body: str
+    joint: int
+    geometry: coal.CollisionGeometry
+    T_joint_part: Array
+    points: Array
+
+    @functools.cached_property
+    def sphere(self) -> tuple[Array, float]:
+        """Centre `(3,)` and radius [m] of a sphere about the part, in the joint's frame."""
+        centre = (self.points.min(0) + self.points.max(0)) / 2
+        return centre, float(np.linalg.norm(self.points - centre, axis=1).max())
+
+    @functools.cached_property
+    def box(self) -> tuple[Array, Array, Array]:
+        """Axes `(3, 3)`, centre `(3,)` and half edges `(3,)` of a box about it, joint's frame."""
+        R = self.T_joint_part[:3, :3]
+        local = self.points @ R
+        low, high = local.min(0), local.max(0)
+        return R, R @ (low + high) / 2, (high - low) / 2
+
+    @functools.cached_property
+    def reach(self) -> float:
+        """How far [m] any point of the part is from the joint's origin."""
+        return float(np.linalg.norm(self.points, axis=1).max())
+
+
+class CollisionModel:
+    """The convex parts of a robot and of a scene, to be put where their bodies are.
+
+    Robot links are the convex hulls of their collision meshes, which enclose them.
+    """
+
+    def __init__(self, robot: RobotSpec, scene: SceneSpec) -> None:
+        """Read the collision geometry of robot and scene.
+
+        Raises:
+            InvalidInput: a body has no shape that collides or is called as a frame of the robot, a
+                joint of the robot doesn't turn about its frame's z axis, or a part of the robot is
+                neither a mesh nor a box, sphere or cylinder.
+        """
+        self.robot = robot
+        self.scene = scene
+        self.kinematics = RobotModel(robot, scene.held)
+        self._parts = robot_parts(self.kinematics)
+        model = self.kinematics.pinocchio_model
+        frames = {frame.name for frame in model.frames}
+        for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+            # What bounds motions takes a joint's axis to be its frame's z.
+            if joint.shortname() != "JointModelRZ":
+                raise InvalidInput(
+                    f"{robot.name}: joint {name!r} doesn't turn about its own z axis; give its "
+                    'URDF the axis "0 0 1"'
+                )
+        for body in scene.bodies:
+            if body.name in frames:
+                raise InvalidInput(
+                    f"body {body.name!r}: the robot has a frame of that name; rename the body"
+                )
+            if not any(shape.collides for shape in body.shapes):
+                raise InvalidInput(
+                    f"body {body.name!r}: no shape of it collides, so nothing can be proved about "
+                    "it; let one collide, or draw it as part of another body"
+                )
+        self._shapes = [
+            (body.name, shape.T_body_shape, coal_geometry(shape), shape.corners())
+            for body in scene.bodies
+            for shape in body.shapes
+            if shape.collides
+        ]
+        home = _link_poses(self.kinematics)
+        self._T_joint_tool = home[robot.tool_frame]
+        self._links = {part.body: inverse(home[part.body]) for part in self._parts}
+        self._self_pairs = self._free_at_home(self._robot_parts(0.0))
+
+    @functools.lru_cache(maxsize=32)  # noqa: B019 - models live as long as their process
+    def _robot_parts(self, gripper: float) -> list[ConvexPart]:
+        """The robot's parts with its gripper at an opening."""
+        poses = _link_poses(RobotModel(self.robot, self.scene.held, gripper))
+        parts = []
+        for part in self._parts:
+            T = poses[part.body] @ self._links[part.body]
+            points = part.points @ T[:3, :3].T + T[:3, 3]
+            parts.append(
+                ConvexPart(part.body, part.joint, part.geometry, T @ part.T_joint_part, points)
+            )
+        return parts
+
+    def placed(
+        self,
+        Ts_world_body: Mapping[str, Array],
+        gripper: float,
+        Ts_tool_carried: Mapping[str, Array] | None = None,
+        allowed: Collection[tuple[str, str]] = (),
+        grasp_play: float = 0.0,
+    ) -> PlacedModel:
+        """The model with the scene's bodies, the gripper and what it carries put in their places.
+
+        Args:
+            Ts_world_body: poses `(4, 4)` of the scene's bodies; a carried one's isn't looked at.
+            gripper: opening in [0, 1].
+            Ts_tool_carried: poses `(4, 4)` in the tool frame of the bodies in the grasp.
+            allowed: pairs of names that may touch, about which nothing is said.
+            grasp_play: how far [m] a carried body may move in the grasp; all distances from it are
+                given less by that.
+
+        Raises:
+            UnknownName: a body's pose is missing, or a name is of no body or link.
+            InvalidInput: gripper out of range, not a pose, or a negative play.
+        """
+        carried = dict(Ts_tool_carried or {})
+        if not (np.isfinite(grasp_play) and grasp_play >= 0):
+            raise InvalidInput(f"grasp_play: expected a finite number >= 0 m, got {grasp_play}")
+        names = [body.name for body in self.scene.bodies]
+        for name in carried:
+            if name not in names:
+                raise unknown_name("carried body", name, names)
+        known = {part.body for part in self._parts} | set(names)
+        for name in {name for pair in allowed for name in pair}:
+            if name not in known:
+                raise unknown_name("body or link", name, sorted(known))
+        last = len(self.robot.arm_joints)
+        parts = list(self._robot_parts(round(float(gripper), 4)))
+        n_robot = len(parts)
+        for name, T_body_shape, geometry, corners in self._shapes:
+            if name in carried:
+                T, joint = self._T_joint_tool @ check_pose(name, carried[name]), last
+            elif name in Ts_world_body:
+                T, joint = check_pose(name, Ts_world_body[name]), 0
+            else:
+                raise unknown_name("body", name, Ts_world_body)
+            points = corners @ T[:3, :3].T + T[:3, 3]
+            parts.append(ConvexPart(name, joint, geometry, T @ T_body_shape, points))
+        pairs = list(self._self_pairs)
+        standing = [i for i in range(n_robot, len(parts)) if parts[i].joint == 0]
+        moving = [i for i in range(len(parts)) if parts[i].joint > 0]
+        pairs += [(i, j) for i in moving for j in standing]
+        in_grasp = [i for i in range(n_robot, len(parts)) if parts[i].joint > 0]
+        pairs += [
+            (i, j)
+            for i in in_grasp
+            for j in range(n_robot)
+            if parts[j].joint <= last - _JOINTS_APART
+        ]
+        skipped = {frozenset(pair) for pair in allowed}
+        pairs = [
+            (i, j) for i, j in pairs if frozenset((parts[i].body, parts[j].body)) not in skipped
+        ]
+        play = [grasp_play if i in in_grasp else 0.0 for i, _ in pairs]
+        return PlacedModel(self.kinematics, parts, pairs, self._T_joint_tool, play)
+
+    def _free_at_home(self, parts: Sequence[ConvexPart]) -> list[tuple[int, int]]:
+        """Pairs of the robot's parts that can collide: neighbours, and what overlaps at home, not.
+
+        The part that more joints move comes first.
+        """
+        pairs = [
+            (i, j)
+            for i, a in enumerate(parts)
+            for j, b in enumerate(parts)
+            if a.joint - b.joint >= _JOINTS_APART
+        ]
+        model = PlacedModel(self.kinematics, parts, pairs, self._T_joint_tool)
+        apart = model.distances(self.robot.home)
+        overlapping = {
+            (parts[i].body, parts[j].body)
+            for (i, j), distance in zip(pairs, apart, strict=True)
+            if distance <= 0
+        }
+        return [(i, j) for i, j in pairs if (parts[i].body, parts[j].body) not in overlapping]
+
+
+class PlacedModel:
+    """Distances between robot and scene with every body in its place, at any joint configuration.
+
+    The *tool bodies* are what the last arm joint carries: gripper, camera, held objects, and what
+    is in the grasp.
+
+    Attributes:
+        kinematics: the robot's kinematics.
+        parts: all convex parts.
+        pairs: `(p, 2)` indices of parts; the first of a pair is moved by more joints.
+        play: `(p,)` [m] by how much each pair may be nearer than the parts as they are placed; it
+            is taken off all distances.
+    """
+
+    def __init__(
+        self,
+        kinematics: RobotModel,
+        parts: Sequence[ConvexPart],
+        pairs: Sequence[tuple[int, int]],
+        T_joint_tool: Array,
+        play: Sequence[float] | None = None,
+    ) -> None:
+        self.kinematics = kinematics
+        self.parts = tuple(parts)
+        self.pairs: Index = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+        self.T_joint_tool = T_joint_tool
+        self.play = np.zeros(len(pairs)) if play is None else np.array(play, dtype=np.float64)
+        self._play = self.play.tolist()
+        self._model = kinematics.pinocchio_model
+        self._data = self._model.createData()
+        self._geometry = pin.GeometryModel()
+        for i, part in enumerate(parts):
+            self._geometry.addGeometryObject(
+                pin.GeometryObject(str(i), part.joint, pin.SE3(part.T_joint_part), part.geometry)
+            )
+        for i, j in pairs:
+            self._geometry.addCollisionPair(pin.CollisionPair(i, j))
+        self._placements = self._geometry.createData()
+        for request in self._placements.distanceRequests:
+            request.gjk_tolerance = _TOLERANCE
+
+    def names(self, pair: int) -> tuple[str, str]:
+        """The names of the two bodies of a pair, by its index."""
+        i, j = self.pairs[pair]
+        return self.parts[i].body, self.parts[j].body
+
+    def joint_poses(self, q: Array) -> Array:
+        """The poses `(n + 1, 4, 4)` of the world and of the arm's joints at `q (n,)`."""
+        pin.forwardKinematics(self._model, self._data, q)
+        return np.array([T.homogeneous for T in self._data.oMi])
+
+    def _place(self, q: Array) -> None:
+        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._placements, q)
+
+    def pair_distances(self, q: Array, pairs: Sequence[int]) -> list[float]:
+        """Signed distances [m] of some pairs, by index, at `q (n,)`."""
+        self._place(q)
+        geometry, data = self._geometry, self._placements
+        play = self._play
+        return [pin.computeDistance(geometry, data, i).min_distance - play[i] for i in pairs]
+
+    def distances(self, q: Array) -> Array:
+        """Signed distances `(p,)` [m] of all pairs at `q (n,)`."""
+        self._place(q)
+        pin.computeDistances(self._geometry, self._placements)
+        results = self._placements.distanceResults
+        return np.array([result.min_distance for result in results]) - self.play
+
+    def witness(self, q: Array, pair: int) -> PairDistance:
+        """A pair's distance and witness points, by its index, at `q (n,)`."""
+        self._place(q)
+        result = pin.computeDistance(self._geometry, self._placements, pair)
+        return PairDistance(
+            *self.names(pair),
+            float(result.min_distance) - self._play[pair],
+            np.array(result.getNearestPoint1()).ravel(),
+            np.array(result.getNearestPoint2()).ravel(),
+        )
+
+    def nearest(self, q: Array) -> PairDistance | None:
+        """The nearest pair of the whole robot at `q (n,)`; `None` if there is nothing to hit.
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+        """
+        q = self.kinematics.check_q(q)
+        if not len(self.pairs):
+            return None
+        return self.witness(q, int(np.argmin(self.distances(q))))
+
+    def gradient(self, q: Array, pair: int) -> Array:
+        """How a pair's distance changes with the joints at `q (n,)`: `(n,)` [m/rad]."""
+        found = self.witness(q, pair)
+        i, j = self.pairs[pair]
+        normal = found.p_a - found.p_b
+        length = float(np.linalg.norm(normal))
+        if length < 1e-9:
+            return np.zeros(len(q))
+        if found.distance + self.play[pair] < 0:
+            length = -length
+        poses = self.joint_poses(q)[1:]
+        moved = cross(poses[:, :3, 2], found.p_a - poses[:, :3, 3]) @ (normal / length)
+        index = np.arange(len(q))
+        between = (index >= self.parts[j].joint) & (index < self.parts[i].joint)
+        return np.where(between, moved, 0.0)
+
+    def too_close(self, q: Array, margin: float) -> tuple[str, str] | None:
+        """The nearest pair at `q (n,)` if it is nearer than the margin [m].
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+        """
+        q, bounds = self.kinematics.check_q(q), self.bounds
+        centres, axes, middles = (each[0] for each in bounds.placed(self.joint_poses(q)[None]))
+        a, b = bounds.first, bounds.second
+        every = np.arange(len(self.pairs))
+        rough = bounds.rough_distances(centres[a], axes[b], middles[b], every)
+        near = np.flatnonzero(rough < margin)
+        if not len(near):
+            return None
+        distances = self.pair_distances(q, near.tolist())
+        least = int(np.argmin(distances))
+        return self.names(int(near[least])) if distances[least] < margin else None
+
+    def tool_pairs(self) -> list[int]:
+        """The pairs, by index, of a tool body and what stands: the scene, and the robot's base."""
+        last = len(self.kinematics.spec.arm_joints)
+        return [
+            k
+            for k, (i, j) in enumerate(self.pairs)
+            if self.parts[i].joint == last and self.parts[j].joint == 0
+        ]
+
+    def tool_clearances(self, q: Array) -> list[PairDistance]:
+        """For each tool body the nearest that stands at `q (n,)`, the nearest pair first.
+
+        What stands is the scene's bodies and the robot's base.
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+        """
+        q = self.kinematics.check_q(q)
+        best: dict[str, tuple[float, int]] = {}
+        pairs = self.tool_pairs()
+        for k, distance in zip(pairs, self.pair_distances(q, pairs), strict=True):
+            body = self.parts[self.pairs[k][0]].body
+            if body not in best or distance < best[body][0]:
+                best[body] = distance, k
+        return sorted((self.witness(q, k) for _, k in best.values()), key=lambda d: d.distance)
+
+    def sphere_clearance(self, p: Array, radius: float) -> PairDistance | None:
+        """The nearest body of the scene to a bare sphere about `p (3,)` [m] in the world.
+
+        What the robot is made of is left out of account: a sphere that is clear says nothing of
+        the tool in it.
+        """
+        sphere, at = coal.Sphere(radius), coal.Transform3s(np.eye(3), np.asarray(p, float))
+        best: PairDistance | None = None
+        for part in self.parts:
+            if part.joint == 0 and part.body not in self._robot_bodies:
+                result = coal.DistanceResult()
+                distance = coal.distance(
+                    sphere, at, part.geometry, coal_transform(part.T_joint_part),
+                    coal.DistanceRequest(), result,
+                )  # fmt: skip
+                if best is None or distance < best.distance:
+                    points = (result.getNearestPoint1(), result.getNearestPoint2())
+                    best = PairDistance(
+                        "sphere", part.body, float(distance), *(np.ravel(x) for x in points)
+                    )
+        return best
+
+    @functools.cached_property
+    def _robot_bodies(self) -> frozenset[str]:
+        return frozenset(frame.name for frame in self._model.frames)
+
+    @functools.cached_property
+    def bounds(self) -> Bounds:
+        """What bounds the pairs' distances and motions from geometry alone."""
+        return Bounds(self)
+
+
+class Bounds:
+    """What bounds distances and motions of a model's pairs from geometry alone.
+
+    The first part of each pair is enclosed in a sphere, the second in a box.
+
+    Attributes:
+        first, second: `(p,)` the parts of each pair.
+        joint_a, joint_b: `(p,)` the joints that carry them.
+        radii: `(p,)` of the spheres [m], the pairs' play among them.
+        half: `(p, 3)` half edges of the boxes [m].
+        reach: `(p, n)` no point of a pair's first part is ever farther [m] from a joint between it
+            and the second than this; 0 for other joints.
+    """
+
+    def __init__(self, model: PlacedModel) -> None:
+        parts, n = model.parts, len(model.kinematics.spec.arm_joints)
+        self.first: Index = model.pairs[:, 0]
+        self.second: Index = model.pairs[:, 1]
+        self._joints: Index = np.array([part.joint for part in parts], np.intp)
+        self._centres = np.array([part.sphere[0] for part in parts]).reshape(-1, 3, 1)
+        boxes = [part.box for part in parts]
+        # Rows are the boxes' axes, so that their product with a vector gives its coordinates.
+        self._axes = np.array([R.T for R, _, _ in boxes]).reshape(-1, 3, 3)
+        self._middles = np.array([p for _, p, _ in boxes]).reshape(-1, 3, 1)
+        self.joint_a: Index = self._joints[self.first]
+        self.joint_b: Index = self._joints[self.second]
+        self.radii = np.array([part.sphere[1] for part in parts])[self.first] + model.play
+        self.half = np.array([half for _, _, half in boxes]).reshape(-1, 3)[self.second]
+        # A chain is the joints from behind b up to a.
+        index = np.arange(n)
+        chain = (index >= self.joint_b[:, None]) & (index < self.joint_a[:, None])
+        self.reach = np.where(chain, _axis_distances(model)[self.first], 0.0)
+
+    def placed(self, poses: Array) -> tuple[Array, Array, Array]:
+        """Spheres and boxes of all parts at joint poses `(k, n + 1, 4, 4)`, in the world.
+
+        Returns:
+            The spheres' centres `(k, parts, 3)`, the boxes' axes `(k, parts, 3, 3)`, a row each,
+            and their middles `(k, parts, 3)`.
+        """
+        T = poses[:, self._joints]
+        R, p = T[..., :3, :3], T[..., :3, 3]
+        centres = (R @ self._centres)[..., 0] + p
+        middles = (R @ self._middles)[..., 0] + p
+        return centres, self._axes @ np.swapaxes(R, -1, -2), middles
+
+    def rough_distances(self, centres: Array, axes: Array, middles: Array, pair: Index) -> Array:
+        """Distances `(..., k)` [m] of pairs from below, without coal.
+
+        Args:
+            centres: of the spheres of the pairs' first parts, `(..., k, 3)`.
+            axes, middles: of the boxes of their second, `(..., k, 3, 3)`, `(..., k, 3)`.
+            pair: `(k,)` pairs by index.
+        """
+        local = np.einsum("...ij,...j->...i", axes, centres - middles)
+        out = np.maximum(np.abs(local) - self.half.take(pair, 0), 0.0)
+        return np.asarray(norms(out) - self.radii.take(pair))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """The cross products `(..., 3)`; NumPy's own takes five times as long."""
+    return np.asarray(a[..., _YZX] * b[..., _ZXY] - a[..., _ZXY] * b[..., _YZX])
+
+
+def norms(vectors: Array) -> Array:
+    """The lengths `(...)` of vectors `(..., 3)`; NumPy's own takes three times as long."""
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
+
+
+def _link_poses(model: RobotModel) -> dict[str, Array]:
+    """The pose `(4, 4)` of each frame on the joint that carries it."""
+    return {
+        frame.name: np.array(frame.placement.homogeneous) for frame in model.pinocchio_model.frames
+    }
+
+
+def _axis_distances(model: PlacedModel) -> Array:
+    """For each part and joint `(parts, n)`: how far [m] a point of the part can be from the joint.
+
+    That is in any configuration, for the joints that carry the part; 0 for others.
+    """
+    joints = model.kinematics.pinocchio_model.jointPlacements
+    distances = np.zeros((len(model.parts), len(joints) - 1))
+    links = [float(np.linalg.norm(T.translation)) for T in joints]
+    for row, part in zip(distances, model.parts, strict=True):
+        reach = part.reach
+        for j in range(part.joint, 0, -1):
+            row[j - 1] = reach
+            reach += links[j]
+    return distances
+
+
+def robot_parts(model: RobotModel) -> list[ConvexPart]:
+    """The convex parts of a robot's links and of what it holds, as its URDF has them.
+
+    Raises:
+        InvalidInput: a part is neither a mesh nor a box, sphere or cylinder.
+    """
+    pinocchio_model = model.pinocchio_model
+    loaded = pin.buildGeomFromUrdf(
+        pinocchio_model,
+        str(model.urdf),
+        pin.GeometryType.COLLISION,
+        package_dirs=str(model.urdf.parent),
+    )
+    parts = []
+    for item in loaded.geometryObjects:
+        geometry = item.geometry
+        if isinstance(geometry, coal.BVHModelBase):
+            geometry.buildConvexHull(True, "Qt")
+            geometry = geometry.convex
+        frame = pinocchio_model.frames[item.parentFrame]
+        T = np.array(item.placement.homogeneous)
+        points = _points(geometry) @ T[:3, :3].T + T[:3, 3]
+        parts.append(ConvexPart(frame.name, int(item.parentJoint), geometry, T, points))
+    return parts
+
+
+def _points(geometry: coal.CollisionGeometry) -> Array:
+    """Points `(n, 3)` whose convex hull encloses a convex geometry."""
+    if isinstance(geometry, coal.ConvexBase):
+        return np.array(geometry.points()).reshape(-1, 3)
+    return primitive(geometry).corners()
+
+
+def primitive(geometry: coal.CollisionGeometry) -> Shape:
+    """A box, sphere or cylinder of a URDF as a shape at its body's origin.
+
+    Raises:
+        InvalidInput: it is none of these.
+    """
+    if isinstance(geometry, coal.Box):
+        x, y, z = (2 * float(half) for half in geometry.halfSide)
+        return Shape("box", (x, y, z))
+    if isinstance(geometry, coal.Sphere):
+        return Shape("sphere", (float(geometry.radius),))
+    if isinstance(geometry, coal.Cylinder):
+        return Shape("cylinder", (float(geometry.radius), 2 * float(geometry.halfLength)))
+    raise InvalidInput(
+        f"geometry {type(geometry).__name__} is neither a mesh nor a box, sphere or cylinder; use "
+        "these in the URDF"
+    )
+
+
+def gap_text(distance: float, margin: float) -> str:
+    """How two bodies at a distance [m] that is less than the margin [m] stand, for a message."""
+    if distance < 0:
+        return f"they overlap by {-distance * 1e3:.1f} mm"
+    return f"{distance * 1e3:.1f} mm apart, {margin * 1e3:.1f} mm are asked for"
+
+
+def coal_geometry(shape: Shape) -> coal.CollisionGeometry:
+    """A shape as coal takes it, at its own origin."""
+    if shape.kind == "box":
+        return coal.Box(*shape.size)
+    if shape.kind == "sphere":
+        return coal.Sphere(*shape.size)
+    return coal.Cylinder(*shape.size)
+
+
+def coal_transform(T: Array) -> coal.Transform3s:
+    """A pose `(4, 4)` as coal takes it."""
+    return coal.Transform3s(T[:3, :3], T[:3, 3])
+
+
+def convex_distance(
+    a: coal.CollisionGeometry,
+    T_a: coal.Transform3s,
+    b: coal.CollisionGeometry,
+    T_b: coal.Transform3s,
+) -> float:
+    """The distance [m] between two convex geometries; negative where they overlap."""
+    # A result that is not new keeps the smallest distance it has seen.
+    result = coal.DistanceResult()
+    return float(coal.distance(a, T_a, b, T_b, coal.DistanceRequest(), result))

@@ -1,0 +1,1 @@
+"""The records that the stages hand to each other, and the only reader and writer of their files."""

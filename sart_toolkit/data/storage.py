@@ -1,0 +1,618 @@
+"""The only place that reads or writes files of ours: HDF5 for arrays, JSON for the rest.
+
+Every write goes to a temporary name beside its target, is flushed to disk and then renamed, so a
+reader sees the old file or the whole new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import io
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sart_toolkit.data.records import (
+    Annotation,
+    CameraRecord,
+    Dataset,
+    Demonstration,
+    Episode,
+    PrecisionSphere,
+    Provenance,
+    Steps,
+)
+from sart_toolkit.errors import (
+    BrokenFile,
+    CannotWrite,
+    InvalidInput,
+    Mismatch,
+    MissingFile,
+    OutputExists,
+    SartError,
+)
+
+SCHEMA_VERSION = 3
+
+
+# --- writing safely -----------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _cannot_write(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except SartError:
+        raise
+    except PermissionError as error:
+        raise CannotWrite(
+            f"{path}: permission denied; choose another --out or mend its permissions"
+        ) from error
+    except OSError as error:
+        raise CannotWrite(
+            f"{path}: {error.strerror or error}; nothing was replaced, make "
+            "room or choose another --out"
+        ) from error
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that becomes `path` when the block ends without an error.
+
+    Raises:
+        CannotWrite: the disk refuses; `path` is as it was.
+    """
+    path = Path(path)
+    temporary: Path | None = None
+    with _cannot_write(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(
+            dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix
+        )
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            yield temporary
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+            umask = os.umask(0)
+            os.umask(umask)
+            os.chmod(temporary, 0o666 & ~umask)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON object, with its `schema_version`, whole or not at all.
+
+    Raises:
+        CannotWrite: the disk refuses.
+        InvalidInput: a number is NaN or infinite, or a value isn't JSON.
+    """
+    try:
+        text = json.dumps({"schema_version": SCHEMA_VERSION, **value}, indent=2, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"{path}: can't be written as JSON: {error}") from error
+    write_text(path, text + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file of ours, without its `schema_version`.
+
+    Raises:
+        MissingFile: no such file.
+        BrokenFile: not a JSON object, or a schema this version doesn't know.
+    """
+    path = _existing(path)
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise BrokenFile(
+            f"{path}: not readable as JSON ({error}); mend or make it again"
+        ) from error
+    except OSError as error:
+        raise BrokenFile(f"{path}: {error.strerror}; check the path and its permissions") from error
+    if not isinstance(value, dict):
+        raise BrokenFile(f"{path}: expected a JSON object, got {type(value).__name__}")
+    _check_schema(path, value.pop("schema_version", None))
+    return value
+
+
+def append_json_line(path: Path, value: Mapping[str, Any]) -> None:
+    """Add a JSON object as one line to the end of a file, made if needed.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    with _cannot_write(Path(path)), open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps(value) + "\n")
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """The JSON objects in a file of lines; none if it isn't there, a line that was cut left out."""
+    rows = []
+    if Path(path).exists():
+        for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
+            with contextlib.suppress(ValueError):
+                rows.append(json.loads(line))
+    return [row for row in rows if isinstance(row, dict)]
+
+
+class Journal:
+    """Rows appended to a file of lines, each on the disk when `append` returns.
+
+    One process at a time has it. A row that a crash cut short is dropped when it is opened again.
+
+    Attributes:
+        path: the file.
+        rows: what it holds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a journal, made if needed.
+
+        Raises:
+            CannotWrite: the disk refuses, or another process has it open.
+        """
+        self.path = Path(path)
+        with _cannot_write(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self.path, "ab+")  # noqa: SIM115 - open until `close`
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self._file.close()
+            raise CannotWrite(
+                f"{self.path}: another process is at work on it; end that one first, or choose "
+                "another --out"
+            ) from error
+        self._file.seek(0)
+        content = self._file.read()
+        self._file.truncate(content.rfind(b"\n") + 1)
+        self.rows = read_json_lines(self.path)
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Add one row.
+
+        Raises:
+            CannotWrite: the disk refuses.
+        """
+        with _cannot_write(self.path):
+            end = self._file.seek(0, os.SEEK_END)
+            try:
+                self._file.write(json.dumps(row, allow_nan=False).encode() + b"\n")
+                self._file.flush()
+                os.fsync(self._file.fileno())
+            except OSError:
+                # What the disk has no room for must not stand before the next row.
+                with contextlib.suppress(OSError):
+                    os.ftruncate(self._file.fileno(), end)
+                raise
+        self.rows.append(dict(row))
+
+    def clear(self) -> None:
+        """Drop all rows."""
+        self._file.truncate(0)
+        self.rows = []
+
+    def close(self, remove: bool = False) -> None:
+        """Let go of the file; with `remove`, remove it too."""
+        if remove and not self._file.closed:
+            self.path.unlink(missing_ok=True)
+        self._file.close()
+
+
+def check_writable(path: Path, overwrite: bool = False) -> None:
+    """Return if a stage may write `path` (a file or directory): absent, or to be overwritten.
+
+    Raises:
+        OutputExists: it is there and `overwrite` is false.
+        CannotWrite: its nearest existing parent refuses new files.
+    """
+    path = Path(path)
+    with _cannot_write(path):
+        if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+            raise OutputExists(f"{path}: already exists; add --overwrite or choose another --out")
+        parent = path if path.is_dir() else path.parent
+        while not parent.exists():
+            parent = parent.parent
+        if not parent.is_dir():
+            raise CannotWrite(f"{path}: {parent} is not a directory; choose another --out")
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+
+
+def remove(path: Path) -> None:
+    """Remove a file or directory tree if it is there.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    path = Path(path)
+    with _cannot_write(path):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def clear_directory(path: Path, mark: str, overwrite: bool) -> None:
+    """Make room for a directory that a stage writes: an empty one or none at all is left.
+
+    Args:
+        path: the directory.
+        mark: the file that such a directory holds; one without it is never removed.
+        overwrite: whether such a directory may be replaced.
+
+    Raises:
+        OutputExists: it is there and may not be replaced.
+        CannotWrite: the disk refuses.
+    """
+    path = Path(path)
+    check_writable(path, overwrite)
+    if path.is_file():
+        raise OutputExists(f"{path}: is a file, so it won't be replaced; choose another --out")
+    if path.is_dir() and any(path.iterdir()) and not (path / mark).exists():
+        raise OutputExists(
+            f"{path}: holds other things (no {mark}), so it won't be replaced; choose another --out"
+        )
+    remove(path)
+
+
+def _existing(path: Path) -> Path:
+    path = Path(path)
+    try:
+        present = path.exists()
+    except OSError as error:
+        raise BrokenFile(f"{path}: {error.strerror}; check the path") from error
+    if not present:
+        raise MissingFile(f"{path}: no such file; check the path, or make it first")
+    if path.is_dir():
+        raise BrokenFile(f"{path}: is a directory; expected a file")
+    return path
+
+
+def _check_schema(path: Path, version: Any) -> None:
+    if version != SCHEMA_VERSION:
+        raise BrokenFile(
+            f"{path}: schema_version is {version!r}, this version reads {SCHEMA_VERSION}; "
+            "make the file again or use the toolkit version that wrote it"
+        )
+
+
+# --- HDF5 ---------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
+    path = _existing(path)
+    try:
+        with h5py.File(path, "r") as file:
+            found = file.attrs.get("kind")
+            if found != kind:
+                raise BrokenFile(f"{path}: holds {found!r}, expected a {kind}; pass another file")
+            version = file.attrs.get("schema_version")
+            _check_schema(path, version.item() if isinstance(version, np.generic) else version)
+            yield file
+    except InvalidInput as error:
+        raise BrokenFile(f"{path}: {error}; restore a copy or make it again") from error
+    except SartError:
+        raise
+    # A damaged file may hold anything in place of a group, a number or JSON.
+    except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise BrokenFile(
+            f"{path}: truncated or not a {kind} file ({error}); restore a copy or make it again"
+        ) from error
+
+
+@contextlib.contextmanager
+def _writing(path: Path, kind: str) -> Iterator[h5py.File]:
+    # In memory first: HDF5 crashes the process when a disk fills up under an open file.
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file.attrs["kind"] = kind
+        file.attrs["schema_version"] = SCHEMA_VERSION
+        yield file
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
+
+
+_STEP_ARRAYS = [f.name for f in dataclasses.fields(Steps) if f.name != "cameras"]
+
+
+def _put_steps(group: h5py.Group, steps: Steps) -> None:
+    for name in _STEP_ARRAYS:
+        group[name] = getattr(steps, name)
+    for name, camera in steps.cameras.items():
+        at = group.create_group(f"cameras/{name}")
+        # One chunk a picture, LZF: a tenth of gzip's time, and a step can be read by itself.
+        for part, frames in (("rgb", camera.rgb), ("depth", camera.depth)):
+            at.create_dataset(
+                part, data=frames, chunks=(1, *frames.shape[1:]), compression="lzf", shuffle=True
+            )
+        at["intrinsics"] = camera.intrinsics
+        at["T_tool_camera"] = camera.T_tool_camera
+
+
+def _get_steps(group: h5py.Group) -> Steps:
+    cameras = {
+        name: CameraRecord(
+            rgb=at["rgb"][()],
+            depth=at["depth"][()],
+            intrinsics=at["intrinsics"][()],
+            T_tool_camera=at["T_tool_camera"][()],
+        )
+        for name, at in group.get("cameras", {}).items()
+    }
+    return Steps(cameras=cameras, **{name: group[name][()] for name in _STEP_ARRAYS})
+
+
+def save_demonstration(path: Path, demonstration: Demonstration) -> None:
+    """Write a demonstration to an HDF5 file, whole or not at all.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    d = demonstration
+    with _writing(path, "demonstration") as file:
+        _put_steps(file.create_group("steps"), d.steps)
+        file["timestamps"] = d.timestamps
+        file["raw_commands"] = d.raw_commands
+        file["success"] = d.success
+        file["touching"] = json.dumps(d.touching)
+        for name, Ts in d.body_Ts_world.items():
+            file[f"body_Ts_world/{name}"] = Ts
+        sizes = np.array([len(state) for state in d.states], dtype=np.int64)
+        file["states/sizes"] = sizes
+        file.create_dataset("states/bytes", data=np.frombuffer(b"".join(d.states), dtype=np.uint8))
+        file.attrs["meta"] = json.dumps(
+            {
+                "task": d.task,
+                "task_parameters": dict(d.task_parameters),
+                "robot": d.robot,
+                "backend": d.backend,
+                "operator": d.operator,
+                "device": d.device,
+                "seconds": d.seconds,
+                "seed": d.seed,
+                "versions": dict(d.versions),
+                "content_hash": d.content_hash(),
+            }
+        )
+
+
+def load_demonstration(path: Path) -> Demonstration:
+    """The demonstration in an HDF5 file.
+
+    Raises:
+        MissingFile: no such file.
+        BrokenFile: truncated, another kind of file, or its content no longer matches its hash.
+    """
+    with _reading(path, "demonstration") as file:
+        meta = json.loads(file.attrs["meta"])
+        expected = meta.pop("content_hash")
+        packed = file["states/bytes"][()].tobytes()
+        ends = np.cumsum(file["states/sizes"][()])
+        starts = ends - file["states/sizes"][()]
+        demonstration = Demonstration(
+            steps=_get_steps(file["steps"]),
+            timestamps=file["timestamps"][()],
+            raw_commands=file["raw_commands"][()],
+            success=file["success"][()],
+            touching=json.loads(file["touching"][()]),
+            body_Ts_world={k: v[()] for k, v in file.get("body_Ts_world", {}).items()},
+            states=tuple(packed[a:b] for a, b in zip(starts, ends, strict=True)),
+            **meta,
+        )
+        if demonstration.content_hash() != expected:
+            raise BrokenFile(
+                f"{path}: content differs from its hash; restore a copy or record again"
+            )
+    return demonstration
+
+
+def save_episode(path: Path, episode: Episode) -> None:
+    """Write one generated episode to an HDF5 file, whole or not at all.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    provenance = dataclasses.asdict(episode.provenance)
+    provenance["T_world_sampled"] = episode.provenance.T_world_sampled.tolist()
+    with _writing(path, "episode") as file:
+        _put_steps(file.create_group("steps"), episode.steps)
+        file["joint_path"] = episode.joint_path
+        file.attrs["provenance"] = json.dumps(provenance)
+        file.attrs["content_hash"] = episode.content_hash()
+
+
+def load_episode(path: Path) -> Episode:
+    """The episode in an HDF5 file.
+
+    Raises:
+        MissingFile: no such file.
+        BrokenFile: truncated or another kind of file.
+    """
+    with _reading(path, "episode") as file:
+        provenance = Provenance(**json.loads(file.attrs["provenance"]))
+        episode = Episode(_get_steps(file["steps"]), provenance, file["joint_path"][()])
+        if file.attrs["content_hash"] != episode.content_hash():
+            raise BrokenFile(f"{path}: content differs from its hash; generate it again")
+        return episode
+
+
+def load_recording(path: Path) -> Demonstration | Episode:
+    """The demonstration or the episode in an HDF5 file.
+
+    Raises:
+        MissingFile: no such file.
+        BrokenFile: truncated or another kind of file.
+    """
+    try:
+        return load_demonstration(path)
+    except BrokenFile as error:
+        if "holds 'episode'" not in str(error):
+            raise
+    return load_episode(path)
+
+
+# --- annotations and datasets -------------------------------------------------------------------
+
+_ANNOTATION_NOTE = (
+    "Precision spheres: the tool may stray radius_m [m] around its pose at each key waypoint. "
+    "Edit a radius_m freely (set source to 'human'); the certificate of a suggested radius no "
+    "longer covers a larger one, and augmentation still rejects every segment that touches."
+)
+
+
+def annotation_to_json(annotation: Annotation) -> dict[str, Any]:
+    """An annotation as JSON values that a person can read and edit."""
+    return {
+        "about": _ANNOTATION_NOTE,
+        "demonstration_hash": annotation.demonstration_hash,
+        "seconds_spent": annotation.seconds,
+        "settings": dict(annotation.settings),
+        "spheres": [
+            {
+                "waypoint": sphere.waypoint,
+                "radius_m": sphere.radius,
+                "kind": sphere.kind,
+                "source": sphere.source,
+                "clearance_m": sphere.clearance,
+                "limited_by": sphere.limited_by,
+                "T_world_key": sphere.T_world_key.tolist(),
+            }
+            for sphere in annotation.spheres
+        ],
+    }
+
+
+def annotation_from_json(value: Mapping[str, Any], path: Path) -> Annotation:
+    """The annotation in JSON values read from `path`.
+
+    Raises:
+        BrokenFile: a field is missing or unknown.
+        InvalidInput: a value is out of range, such as a radius <= 0 or NaN.
+    """
+    try:
+        unknown = set(value) - {
+            "about", "demonstration_hash", "seconds_spent", "settings", "spheres"
+        }  # fmt: skip
+        if unknown:
+            raise BrokenFile(f"{path}: unknown field {sorted(unknown)[0]!r}; remove it")
+        spheres = []
+        for row in value["spheres"]:
+            unknown = set(row) - {
+                "waypoint", "radius_m", "kind", "source", "clearance_m", "limited_by", "T_world_key"
+            }  # fmt: skip
+            if unknown:
+                raise BrokenFile(f"{path}: unknown sphere field {sorted(unknown)[0]!r}; remove it")
+            spheres.append(
+                PrecisionSphere(
+                    waypoint=row["waypoint"],
+                    T_world_key=row["T_world_key"],
+                    radius=row["radius_m"],
+                    kind=row.get("kind", "ball"),
+                    source=row.get("source", "human"),
+                    clearance=row.get("clearance_m"),
+                    limited_by=row.get("limited_by"),
+                )
+            )
+        return Annotation(
+            tuple(spheres),
+            value["demonstration_hash"],
+            float(value.get("seconds_spent", 0.0)),
+            value.get("settings", {}),
+        )
+    except SartError as error:
+        if isinstance(error, InvalidInput):
+            raise InvalidInput(f"{path}: {error}") from error
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise BrokenFile(f"{path}: not an annotation, {error!r} is missing or wrong") from error
+
+
+def save_annotation(path: Path, annotation: Annotation) -> None:
+    """Write an annotation to a JSON file that a person can read and edit.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    write_json(path, annotation_to_json(annotation))
+
+
+def load_annotation(path: Path) -> Annotation:
+    """The annotation in a JSON file.
+
+    Raises:
+        MissingFile: no such file.
+        BrokenFile: not JSON, or a field is missing or unknown.
+        InvalidInput: a value is out of range.
+    """
+    return annotation_from_json(read_json(path), Path(path))
+
+
+def episode_name(sphere: int, k: int) -> str:
+    """The file name of the k-th episode generated from a sphere."""
+    return f"sphere{sphere:02d}_k{k:05d}.h5"
+
+
+def load_dataset_info(path: Path) -> dict[str, Any]:
+    """What `dataset.json` says in a directory that `sart augment` made.
+
+    Raises:
+        MissingFile: no such directory, or it holds no dataset.
+        BrokenFile: generation was interrupted (run it again to resume), or the file is damaged.
+    """
+    path = Path(path)
+    if not os.path.isdir(path):
+        raise MissingFile(f"{path}: no such dataset directory; make it with `sart augment`")
+    if not (path / "dataset.json").exists() and (path / "attempts.jsonl").exists():
+        raise BrokenFile(f"{path}: generation was interrupted; run `sart augment` again to resume")
+    return read_json(path / "dataset.json")
+
+
+def load_dataset(path: Path) -> Dataset:
+    """The dataset in a directory that `sart augment` made, whole.
+
+    Raises:
+        MissingFile: a file of the dataset isn't there.
+        BrokenFile: generation was interrupted (run it again to resume), or a file is damaged.
+        Mismatch: the annotation or an episode belongs to another demonstration.
+    """
+    path = Path(path)
+    info = load_dataset_info(path)
+    demonstration = load_demonstration(path / "demo.h5")
+    annotation = load_annotation(path / "annotation.json")
+    annotation.check_matches(demonstration)
+    names = info.get("episodes")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BrokenFile(f"{path / 'dataset.json'}: lists no episodes; generate again")
+    episodes = tuple(load_episode(path / "episodes" / name) for name in names)
+    for name, episode in zip(names, episodes, strict=True):
+        if episode.provenance.demonstration_hash != annotation.demonstration_hash:
+            raise Mismatch(f"{path}: {name} belongs to another demonstration; generate it again")
+    dataset = Dataset(demonstration, annotation, episodes, info)
+    if info.get("content_hash") != dataset.content_hash():
+        raise BrokenFile(f"{path}: content differs from its hash; generate it again")
+    return dataset

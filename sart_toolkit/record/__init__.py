@@ -1,0 +1,1 @@
+"""Demonstrations: the recording session, what steers it, and its window."""

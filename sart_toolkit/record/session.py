@@ -1,0 +1,463 @@
+"""Teleoperation: a device steers the tool at 30 Hz, the session records at 10 Hz.
+
+`TeleopSession` is the recording itself, moved on by whoever calls it: `record_demonstration` for a
+script, `teach.desk` for a person.
+"""
+
+from __future__ import annotations
+
+import abc
+import enum
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from sart_toolkit.backends.interface import Backend, Contact, Observation
+from sart_toolkit.data.records import (
+    CONTROL_HZ,
+    CONTROL_PER_RECORD,
+    RECORD_HZ,
+    Demonstration,
+    library_versions,
+)
+from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
+from sart_toolkit.motion.controller import ControllerConfig, ToolController
+from sart_toolkit.poses import Array, apply_motion, check_array, check_positive, frozen
+from sart_toolkit.record.recorder import StepRecorder
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import check_gripper
+from sart_toolkit.scenes.spec import SceneState
+from sart_toolkit.tasks.task import Placement, Task
+
+Frame = Literal["world", "tool"]
+
+_log = logging.getLogger(__name__)
+# A joint nearer to its limit than this [rad] is what is in the way.
+_AT_LIMIT = 0.05
+
+
+@dataclass(frozen=True)
+class TeleopCommand:
+    """What a device asks for over the next 1/30 s.
+
+    `velocity (6,)`: of the tool in the tool's frame, xyz [m/s] and rotation [rad/s]; `gripper` in
+    [0, 1]; `stop` ends the recording before the command is carried out.
+    """
+
+    velocity: Array
+    gripper: float
+    stop: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "velocity", frozen(check_array("velocity", self.velocity, (6,))))
+        check_gripper(self.gripper)
+
+
+@dataclass(frozen=True)
+class DeviceSetup:
+    """What a device is made for.
+
+    `backend`, `task`, `model`: the robot in its scene, what it is to do there, and its kinematics;
+    `state`: the start; `rng`: a script's randomness; `frame`, "world" or "tool": what a person's
+    directions are fixed to at first; `operator`: who steers, where it is a person.
+    """
+
+    backend: Backend
+    task: Task
+    model: RobotModel
+    state: SceneState
+    rng: np.random.Generator
+    frame: Frame = "world"
+    operator: str = "person"
+
+
+class Device(abc.ABC):
+    """What a person, or a script in a person's place, steers with.
+
+    Attributes:
+        name: kept with the demonstration.
+        operator: who steers.
+        interactive: whether a person holds it, and so needs to see what happens.
+    """
+
+    name: str
+    operator: str
+    interactive: bool = False
+
+    @abc.abstractmethod
+    def read(self, observation: Observation) -> TeleopCommand:
+        """The command for the next 1/30 s, having seen what the robot measures now."""
+
+
+@dataclass(frozen=True)
+class SessionConfig:
+    """How a demonstration is recorded: cameras, and the longest it may last [s].
+
+    Without `keep_states` no generated trajectory can start from it, and recording is faster.
+    `end_on_success`: it ends by itself once the goal has been reached for the task's `hold`.
+    """
+
+    cameras: tuple[str, ...] = ("wrist",)
+    max_seconds: float = 120.0
+    keep_states: bool = True
+    end_on_success: bool = False
+    controller: ControllerConfig = field(default_factory=ControllerConfig)
+
+    def __post_init__(self) -> None:
+        check_positive("max_seconds", self.max_seconds, "s")
+
+
+class SessionState(enum.Enum):
+    """What a session is at; the value is the word that a person reads."""
+
+    READY = "ready"
+    RECORDING = "recording"
+    PAUSED = "paused"
+    ENDED = "ended"
+    SAVED = "saved"
+
+
+class End(enum.Enum):
+    """Why a recording ended."""
+
+    STOPPED = "stopped"
+    SUCCESS = "goal reached"
+    TIME = "time is up"
+
+
+class TeleopSession:
+    """A demonstration in the making: ready, recording, paused, ended, saved.
+
+    It never waits and draws nothing: each `advance` is one control period, 1/30 s, of simulation.
+    While it isn't recording the simulation stands still.
+
+    Attributes:
+        state: what it is at.
+        end: why it ended, once it has.
+        gripper: the gripper command in force, in [0, 1].
+        trouble: why the last command was not carried out; empty where it was.
+        contacts: what the robot, or what it carries, touched in the last control period, but for
+            what it carries itself; the firmest first.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        task: Task,
+        model: RobotModel,
+        placement: Placement | None = None,
+        config: SessionConfig | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Ready to record, robot and scene as at the task's start.
+
+        Args:
+            backend: the robot in the task's scene.
+            task: what is demonstrated.
+            model: the robot's kinematics.
+            placement: where the object stands; in the middle of its range if left out.
+            config: cameras and limits.
+            clock: tells the wall-clock time [s].
+        """
+        self.backend, self.task, self.model = backend, task, model
+        self.placement = placement or Placement()
+        self.config = config or SessionConfig()
+        self._clock = clock
+        self._started_at: float | None = None
+        self._seconds_spent = 0.0
+        self._controller = ToolController(model, self.config.controller)
+        self._feels = backend.capabilities.has_contacts
+        self._keeps = backend.capabilities.can_restore and self.config.keep_states
+        self._prepare()
+
+    def _prepare(self) -> None:
+        state = self.task.initial_state(self.model, self.placement)
+        self.backend.reset(state)
+        self._controller.reset(state.q)
+        self._recorder = StepRecorder(self.backend, self.config.cameras)
+        self.gripper = state.commanded_gripper
+        self._now = self._recorder.add(self._controller, self.gripper, self._no_force())
+        self._states = [self.backend.save()] if self._keeps else []
+        self._success, self._raw = [self.task.success(self._now)], list[Array]()
+        self._touching: list[tuple[tuple[str, str], ...]] = [()]
+        self._felt: list[Contact] = []
+        self.state, self.end = SessionState.READY, End.STOPPED
+        self.trouble, self.contacts = "", list[Contact]()
+
+    def _no_force(self) -> float:
+        return 0.0 if self._feels else np.nan
+
+    # --- what a person sees ---------------------------------------------------------------------
+
+    @property
+    def observation(self) -> Observation:
+        """What the robot measures now."""
+        return self._now
+
+    @property
+    def recorded(self) -> Observation:
+        """What was recorded last, with the pictures of the session's cameras."""
+        return self._recorder.observations[-1]
+
+    @property
+    def steps(self) -> int:
+        """How many 10 Hz steps are recorded, the start among them."""
+        return len(self._success)
+
+    @property
+    def seconds(self) -> float:
+        """How long the recording is by now [s]."""
+        return len(self._raw) / CONTROL_HZ
+
+    @property
+    def seconds_spent(self) -> float:
+        """Wall-clock time [s] from the first start to the end, or to now: redos, pauses and all."""
+        if self._started_at is None or self.state in (SessionState.ENDED, SessionState.SAVED):
+            return self._seconds_spent
+        return self._clock() - self._started_at
+
+    @property
+    def success(self) -> bool:
+        """Whether the goal was reached at the step recorded last."""
+        return self._success[-1]
+
+    @property
+    def success_held(self) -> float:
+        """For how long [s] up to now the goal has been reached at every step."""
+        misses = [t for t, reached in enumerate(self._success) if not reached]
+        return (len(self._success) - 1 - (misses[-1] if misses else -1)) / RECORD_HZ
+
+    @property
+    def achieved(self) -> bool:
+        """Whether what is recorded counts as a success of the task."""
+        return self.task.achieved(np.array(self._success))
+
+    # --- what a person does ---------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin to record, or go on after a pause.
+
+        Raises:
+            InvalidInput: there is nothing to start or go on with.
+        """
+        self._expect("start", SessionState.READY, SessionState.PAUSED)
+        if self._started_at is None:
+            self._started_at = self._clock()
+        self.state = SessionState.RECORDING
+
+    def pause(self) -> None:
+        """Stand still, recording nothing, until `start`.
+
+        Raises:
+            InvalidInput: it isn't recording.
+        """
+        self._expect("pause", SessionState.RECORDING)
+        self.state = SessionState.PAUSED
+
+    def redo(self) -> None:
+        """Forget what was recorded; robot and scene are as at the start again.
+
+        Raises:
+            InvalidInput: the recording is saved.
+        """
+        self._expect(
+            "redo",
+            SessionState.READY,
+            SessionState.RECORDING,
+            SessionState.PAUSED,
+            SessionState.ENDED,
+        )
+        self._prepare()
+
+    def stop(self) -> None:
+        """End the recording, the robot still to the end of a 10 Hz step.
+
+        Raises:
+            InvalidInput: nothing is being recorded.
+        """
+        self._expect("stop", SessionState.RECORDING, SessionState.PAUSED)
+        self._step(np.zeros(6), self.gripper)
+        while len(self._raw) % CONTROL_PER_RECORD:
+            self._step(np.zeros(6), self.gripper)
+        self._end(End.STOPPED)
+
+    def mark_saved(self) -> None:
+        """Note that the ended recording is safe.
+
+        Raises:
+            InvalidInput: it hasn't ended.
+        """
+        self._expect("mark_saved", SessionState.ENDED)
+        self.state = SessionState.SAVED
+
+    def advance(self, command: TeleopCommand) -> None:
+        """Carry a command out for one control period, 1/30 s; every third one ends a 10 Hz step.
+
+        A command that leads out of reach is not carried out: the tool stays where it is, and
+        `trouble` says why.
+
+        Raises:
+            InvalidInput: it isn't recording.
+        """
+        self._expect("advance", SessionState.RECORDING)
+        if command.stop:
+            self.stop()
+            return
+        self._step(command.velocity, command.gripper)
+        if len(self._raw) % CONTROL_PER_RECORD:
+            return
+        if self.config.end_on_success and self.achieved:
+            self._end(End.SUCCESS)
+        elif len(self._success) > self.config.max_seconds * RECORD_HZ:
+            self._end(End.TIME)
+
+    def _expect(self, what: str, *states: SessionState) -> None:
+        if self.state not in states:
+            raise InvalidInput(
+                f"{what}: the session is {self.state.value}; expected it to be "
+                f"{' or '.join(state.value for state in states)}"
+            )
+
+    def _end(self, end: End) -> None:
+        self._seconds_spent = self.seconds_spent
+        self.state, self.end = SessionState.ENDED, end
+
+    # --- one control period ---------------------------------------------------------------------
+
+    def _step(self, velocity: Array, gripper: float) -> None:
+        """Steer for one control period and measure; every third one is recorded."""
+        self.gripper = gripper
+        self._raw.append(np.append(velocity, gripper))
+        self.backend.command(self._steered(velocity), gripper)
+        self.backend.step()
+        felt = self.backend.contacts() if self._feels else []
+        self._felt += felt
+        self.contacts = self._outer(felt)
+        if len(self._raw) % CONTROL_PER_RECORD:
+            self._now = self.backend.observe()
+            return
+        force = max([self._no_force(), *(contact.force for contact in self._felt)])
+        self._now = self._recorder.add(self._controller, gripper, force)
+        self._touching.append(tuple(sorted({(contact.a, contact.b) for contact in self._felt})))
+        self._felt = []
+        if self._keeps:
+            self._states.append(self.backend.save())
+        self._success.append(self.task.success(self._now))
+
+    def _steered(self, velocity: Array) -> Array:
+        """Joint targets `(n,)` after one control period of a tool velocity; else stay, and say."""
+        controller = self._controller
+        desired = apply_motion(controller.commanded_T_world_tool, velocity / CONTROL_HZ)
+        try:
+            targets = controller.move(desired, self._now.T_world_tool, 1)[0]
+        except (Unreachable, MotionRejected) as error:
+            trouble = self._named_trouble(error)
+            if trouble != self.trouble:
+                _log.warning("command not carried out: %s", error)
+            self.trouble = trouble
+            return controller.commanded_q
+        self.trouble = ""
+        return targets
+
+    def _named_trouble(self, error: Unreachable | MotionRejected) -> str:
+        q = self._controller.commanded_q
+        room = np.minimum(q - self.model.lower, self.model.upper - q)
+        joint = int(np.argmin(room))
+        if room[joint] < _AT_LIMIT:
+            return f"joint limit: {self.model.spec.arm_joints[joint]}"
+        return "joints would jump" if isinstance(error, MotionRejected) else "out of reach"
+
+    def _outer(self, felt: list[Contact]) -> list[Contact]:
+        scene, pairs = self.task.scene, {(contact.a, contact.b) for contact in felt}
+        grasped = scene.grasped(pairs, self.model.spec.gripper.finger_links)
+        outer = scene.outer_contacts(pairs, grasped)
+        return sorted((c for c in felt if (c.a, c.b) in outer), key=lambda c: -c.force)
+
+    # --- the result -----------------------------------------------------------------------------
+
+    def demonstration(
+        self, operator: str, device: str, seconds: float, seed: int | None = None
+    ) -> Demonstration:
+        """What was recorded, as a record.
+
+        Args:
+            operator: who steered.
+            device: with what.
+            seconds: wall-clock time to put down as spent.
+            seed: the device's, if it has one.
+
+        Raises:
+            InvalidInput: the recording hasn't ended.
+        """
+        self._expect("demonstration", SessionState.ENDED, SessionState.SAVED)
+        steps = self._recorder.steps()
+        rows = self._recorder.observations
+        return Demonstration(
+            task=self.task.name,
+            task_parameters={"placement": self.placement.to_json()},
+            robot=self.model.spec.name,
+            backend=self.backend.name,
+            steps=steps,
+            timestamps=np.arange(len(steps)) / RECORD_HZ,
+            body_Ts_world={
+                name: np.stack([row.Ts_world_body[name] for row in rows])
+                for name in rows[0].Ts_world_body
+            },
+            success=np.array(self._success),
+            touching=tuple(self._touching),
+            raw_commands=np.stack(self._raw),
+            states=tuple(self._states),
+            operator=operator,
+            device=device,
+            seconds=seconds,
+            seed=seed,
+            versions=library_versions(),
+        )
+
+
+def record_demonstration(
+    backend: Backend,
+    task: Task,
+    model: RobotModel,
+    device: Device,
+    placement: Placement | None = None,
+    seed: int | None = None,
+    config: SessionConfig | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Demonstration:
+    """One demonstration of a task, steered by a device until it says stop, as fast as it goes.
+
+    A command that leads out of reach is not carried out: the tool stays where it is. No person's
+    time is spent, so `seconds` is the length of the recording.
+
+    Args:
+        backend: the robot in the task's scene.
+        task: what is demonstrated.
+        model: the robot's kinematics.
+        device: what steers.
+        placement: where the object stands; in the middle of its range if left out.
+        seed: the device's seed, kept with the demonstration.
+        config: cameras and limits.
+        progress: called with the seconds recorded so far.
+
+    Raises:
+        InvalidInput: the device did not stop within `max_seconds`.
+    """
+    session = TeleopSession(backend, task, model, placement, config)
+    session.start()
+    steps = session.steps
+    while session.state is SessionState.RECORDING:
+        session.advance(device.read(session.observation))
+        if progress is not None and session.steps > steps:
+            steps = session.steps
+            progress(steps / RECORD_HZ)
+    if session.end is End.TIME:
+        raise InvalidInput(
+            f"the demonstration did not end within {session.config.max_seconds:g} s: "
+            f"{task.shortfall(session.observation)}; steer on, or allow more with max_seconds"
+        )
+    return session.demonstration(device.operator, device.name, session.steps / RECORD_HZ, seed)

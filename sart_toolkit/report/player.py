@@ -1,0 +1,343 @@
+"""What was recorded, to look at again: pictures and facts by waypoint, as a film or in a window."""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from typing import Literal
+
+import numpy as np
+
+from sart_toolkit.backends.interface import Backend
+from sart_toolkit.collision.demonstrated import demonstration_phases
+from sart_toolkit.data.records import RECORD_HZ, Demonstration, Episode, Image
+from sart_toolkit.errors import InvalidInput, unknown_name
+from sart_toolkit.poses import Array, check_positive, inverse
+from sart_toolkit.record.screen import (
+    BACKGROUND,
+    BLUE,
+    BRIGHT,
+    CARD,
+    FAINT,
+    GREEN,
+    LINE,
+    ORANGE,
+    TEXT,
+    Closed,
+    Key,
+    Screen,
+)
+from sart_toolkit.report.video import inset, strip
+from sart_toolkit.scenes.spec import SceneState
+
+FILM_SIZE = 480
+_WINDOW_SIZE = 448
+# Pictures of the scene kept in the window, so that stepping to and fro is quick.
+_KEPT = 120
+
+
+class Playback:
+    """A demonstration, or an episode and the part of its demonstration that it joins.
+
+    Attributes:
+        title: what is played.
+        demonstration: what was shown, or what the episode was made from.
+        split: how many waypoints come from the episode; 0 for a demonstration.
+        camera: the recorded camera whose pictures are shown; another of them may be set.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        demonstration: Demonstration,
+        episode: Episode | None = None,
+    ) -> None:
+        """Play a demonstration, or one of the episodes made from it.
+
+        Args:
+            title: what it is called.
+            demonstration: what was shown.
+            episode: its segment is played first, then the demonstration from `t_star`.
+
+        Raises:
+            InvalidInput: no pictures were recorded.
+        """
+        self.title, self.demonstration = title, demonstration
+        self._parts = [(demonstration.steps, t) for t in range(len(demonstration))]
+        self.split = 0
+        if episode is not None:
+            self.split = len(episode)
+            segment = [(episode.steps, i) for i in range(len(episode))]
+            self._parts = segment + self._parts[episode.provenance.t_star :]
+        self._first = 0 if episode is None else episode.provenance.t_star
+        cameras = list(demonstration.steps.cameras)
+        if not cameras:
+            raise InvalidInput(f"{title}: holds no pictures; record it with a camera")
+        self.camera = cameras[0]
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts [s]."""
+        return (len(self) - 1) / RECORD_HZ
+
+    def waypoint(self, i: int) -> int:
+        """The demonstration's waypoint at step `i`; in a segment, the one it joins."""
+        return self._first + max(0, i - self.split)
+
+    def picture(self, i: int) -> Image:
+        """What the recorded camera saw at step `i`, `(H, W, 3)` uint8."""
+        steps, t = self._parts[i]
+        return steps.cameras[self.camera].rgb[t]
+
+    def gripper(self, i: int) -> tuple[float, float]:
+        """The gripper's measured and commanded opening at step `i`, in [0, 1]."""
+        steps, t = self._parts[i]
+        return float(steps.measured_gripper[t]), float(steps.commanded_gripper[t])
+
+    def force(self, i: int) -> float:
+        """The contact force at step `i` [N]; NaN where it was not measured."""
+        steps, t = self._parts[i]
+        return float(steps.contact_force[t])
+
+    def success(self, i: int) -> bool:
+        """Whether the goal was reached at step `i`; never within an episode's segment."""
+        return i >= self.split and bool(self.demonstration.success[self.waypoint(i)])
+
+    def part(self, i: int) -> Literal["demonstration", "segment"]:
+        """Where step `i` comes from."""
+        return "segment" if i < self.split else "demonstration"
+
+    def joints(self, i: int) -> tuple[Array, Array]:
+        """The measured joints `(n,)` [rad] and tool pose `(4, 4)` at step `i`."""
+        steps, t = self._parts[i]
+        return steps.joint_positions[t], steps.measured_Ts_world_tool[t]
+
+
+class SceneView:
+    """Draws the scene from outside as it was at each step, from recorded joints and bodies.
+
+    Through an episode's segment the bodies are where the demonstration had them at the waypoint
+    that it joins, and what is carried moves with the tool.
+    """
+
+    def __init__(self, playback: Playback, backend: Backend, camera: str) -> None:
+        """Draw with a backend of the demonstration's robot and scene.
+
+        Raises:
+            UnknownName: no such camera in the scene.
+            InvalidInput: where the bodies were wasn't recorded.
+        """
+        if camera not in backend.cameras:
+            known = {*backend.cameras, *playback.demonstration.steps.cameras}
+            raise unknown_name("camera", camera, known)
+        missing = [
+            body.name
+            for body in backend.scene.bodies
+            if body.name not in playback.demonstration.body_Ts_world
+        ]
+        if missing:
+            raise InvalidInput(
+                f"{playback.title}: doesn't tell where {missing[0]!r} was, so the scene can't be "
+                f"drawn; add --camera {playback.camera}"
+            )
+        self._playback, self._backend, self._camera = playback, backend, camera
+        self._phases = demonstration_phases(playback.demonstration, backend.robot, backend.scene)
+
+    def picture(self, i: int, size: int) -> Image:
+        """The scene at step `i`, `(size, size, 3)` uint8."""
+        self._backend.reset(self._state(i))
+        return self._backend.observe((self._camera,), size).cameras[self._camera].rgb
+
+    def _state(self, i: int) -> SceneState:
+        playback, scene = self._playback, self._backend.scene
+        shown, t = playback.demonstration, playback.waypoint(i)
+        Ts = {body.name: shown.body_Ts_world[body.name][t] for body in scene.bodies}
+        q, T_world_tool = playback.joints(i)
+        T_moved = T_world_tool @ inverse(shown.steps.measured_Ts_world_tool[t])
+        for name in self._phases[t].carried:
+            Ts[name] = T_moved @ Ts[name]
+        joints = {name: scene.joint_position(name, Ts) for name in scene.jointed}
+        for name, body in scene.jointed.items():
+            assert body.joint is not None
+            joints[name] = float(np.clip(joints[name], body.joint.lower, body.joint.upper))
+        free = {name: T for name, T in Ts.items() if name not in joints}
+        gripper = float(np.clip(playback.gripper(i)[0], 0.0, 1.0))
+        return scene.initial_state(q, gripper, free, joints)
+
+
+def film(playback: Playback, scene: SceneView | None) -> Iterator[Image]:
+    """The frames of a film, one each 10 Hz step.
+
+    Args:
+        playback: what is shown.
+        scene: draws it from outside, the wrist view inset; without it the wrist view alone.
+    """
+    for i in range(len(playback)):
+        picture = playback.picture(i)
+        frame = picture if scene is None else inset(scene.picture(i, FILM_SIZE), picture)
+        yield strip(_large(frame), _facts(playback, i), i / RECORD_HZ)
+
+
+def _large(frame: Image) -> Image:
+    """A small picture made large enough to write under, each pixel a square."""
+    times = max(1, round(FILM_SIZE / frame.shape[0]))
+    return np.repeat(np.repeat(frame, times, axis=0), times, axis=1)
+
+
+def _facts(playback: Playback, i: int) -> str:
+    force = playback.force(i)
+    felt = "" if np.isnan(force) else f" · {force:.0f} N"
+    reached = " · goal reached" if playback.success(i) else ""
+    return f"{playback.part(i)} · gripper {playback.gripper(i)[0]:.2f}{felt}{reached}"
+
+
+class PlayWindow:
+    """Shows a playback in a window until it is closed.
+
+    Attributes:
+        at: the step shown.
+        playing: whether it moves on by itself.
+    """
+
+    def __init__(
+        self,
+        playback: Playback,
+        scene: SceneView | None,
+        screen: Screen,
+        speed: float = 1.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Begin to play.
+
+        Args:
+            playback: what is shown.
+            scene: draws it from outside; without it the wrist view is shown large.
+            screen: where it is drawn.
+            speed: times real time.
+            clock: tells the time [s].
+
+        Raises:
+            InvalidInput: the speed is not positive.
+        """
+        self._period = 1.0 / (RECORD_HZ * check_positive("speed", speed))
+        self._playback, self._scene, self._screen = playback, scene, screen
+        self._speed, self._clock = speed, clock
+        self._kept: OrderedDict[int, Image] = OrderedDict()
+        self.at, self.playing = 0, True
+        self.closed = False
+
+    def run(self) -> None:
+        """Play until the window is closed."""
+        due = self._clock()
+        shown = None
+        while not self.closed:
+            for event in self._screen.events():
+                if isinstance(event, Closed):
+                    self.closed = True
+                elif isinstance(event, Key) and event.down:
+                    self.key(event.name)
+                    due = self._clock() + self._period
+            if self.playing and self._clock() >= due:
+                self.step(1)
+                # Where drawing takes longer than a step, no step is left out.
+                due = max(due + self._period, self._clock())
+            if shown != (self.at, self.playing):
+                self.draw()
+                shown = (self.at, self.playing)
+            else:
+                time.sleep(0.005)
+
+    def key(self, name: str) -> None:
+        """Do what a key means, by pygame's name of it."""
+        last = len(self._playback) - 1
+        match name:
+            case "space":
+                if not self.playing and self.at == last:
+                    self.at = 0
+                self.playing = not self.playing
+            case "right" | "left":
+                self.playing = False
+                self.step(1 if name == "right" else -1)
+            case "home" | "end":
+                self.playing = False
+                self.at = 0 if name == "home" else last
+            case "escape":
+                self.closed = True
+
+    def step(self, by: int) -> None:
+        """Go on, or back, by a number of steps, as far as there are any."""
+        last = len(self._playback) - 1
+        self.at = min(max(self.at + by, 0), last)
+        if self.playing and self.at == last:
+            self.playing = False
+
+    def _scene_picture(self) -> Image:
+        i = self.at
+        if self._scene is None:
+            return self._playback.picture(i)
+        if i not in self._kept:
+            self._kept[i] = self._scene.picture(i, _WINDOW_SIZE)
+            if len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[i]
+
+    def draw(self) -> None:
+        """Draw the window once."""
+        screen, playback, i = self._screen, self._playback, self.at
+        screen.clear()
+        screen.picture((16, 16, 720, 720), self._scene_picture())
+        screen.text((752, 14), playback.title, 22, BRIGHT, bold=True)
+        shown = playback.demonstration
+        screen.text(
+            (752, 48), f"{shown.task}  ·  {shown.backend}  ·  by {shown.operator}", 14, FAINT
+        )
+        screen.box((752, 76, 512, 52), CARD, edge=BLUE if self.playing else LINE)
+        screen.text((768, 89), "playing" if self.playing else "stopped", 22, BRIGHT, bold=True)
+        screen.text((1250, 87), f"{i / RECORD_HZ:.1f} s", 24, BRIGHT, align="right")
+        screen.picture((752, 140, 320, 320), playback.picture(i))
+        screen.box((758, 434, 20 + 8 * len(playback.camera), 20), BACKGROUND, radius=4)
+        screen.text((764, 435), playback.camera, 13, FAINT)
+        measured, commanded = playback.gripper(i)
+        force = playback.force(i)
+        self._fact(140, "Step", f"{i + 1} of {len(playback)}")
+        self._fact(196, "From the", playback.part(i))
+        self._fact(252, "Waypoint", str(playback.waypoint(i)) if i >= playback.split else "–")
+        self._fact(308, "Gripper, told", f"{measured:.2f}, {commanded:.2f}")
+        words = "not measured" if np.isnan(force) else f"{force:.0f} N"
+        self._fact(364, "Contact force", words, ORANGE if force > 0 else TEXT)
+        reached = playback.success(i)
+        self._fact(420, "Goal", "reached" if reached else "–", GREEN if reached else TEXT)
+        screen.box((752, 480, 512, 256), CARD)
+        rows = (
+            ("Space", "stop, play"), ("→ ←", "one step on, back"), ("Home End", "first, last step"),
+            ("Esc", "close"),
+        )  # fmt: skip
+        for row, (keys, what) in enumerate(rows):
+            screen.text((768, 496 + 30 * row), keys, 15, BRIGHT, bold=True)
+            screen.text((880, 496 + 30 * row), what, 15, TEXT)
+        screen.text(
+            (768, 704),
+            "in real time" if self._speed == 1 else f"{self._speed:g} times real time",
+            13,
+            FAINT,
+        )
+        self._timeline()
+        screen.show()
+
+    def _fact(self, top: int, name: str, value: str, colour: str = TEXT) -> None:
+        self._screen.text((1090, top), name, 13, FAINT)
+        self._screen.text((1090, top + 18), value, 18, colour, bold=True)
+
+    def _timeline(self) -> None:
+        """Segment and demonstration side by side, as far as they are played."""
+        last = max(1, len(self._playback) - 1)
+        screen, left, width = self._screen, 16, 1248
+        screen.bar((left, 762, width, 10), self.at / last, BLUE)
+        if self._playback.split:
+            x = left + round(width * self._playback.split / last)
+            screen.box((x - 1, 754, 3, 26), ORANGE, radius=1)
+        screen.dot((left + round(width * self.at / last), 767), 9, BRIGHT)

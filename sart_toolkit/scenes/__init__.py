@@ -1,0 +1,1 @@
+"""A scene as data: bodies, joints, cameras and light."""

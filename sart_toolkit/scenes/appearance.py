@@ -1,0 +1,101 @@
+"""Other colours, light and camera mountings for the same scene, to try or train a policy on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sart_toolkit.errors import InvalidInput
+from sart_toolkit.poses import Array, exp_rotation, orthonormalised
+from sart_toolkit.robots.spec import CameraSpec, RobotSpec, Shape
+from sart_toolkit.scenes.spec import Body, SceneSpec
+
+
+@dataclass(frozen=True)
+class AppearanceConfig:
+    """How far looks vary; every value is the half width of a uniform law.
+
+    `colour`: of each channel of a shape's colour, in [0, 1]; `light`, `ambient`: relative, of the
+    light's intensity and of what it leaves in shadow; `light_deg`: of the light's direction;
+    `camera` [m] and `camera_deg`: of the wrist camera's mounting.
+    """
+
+    colour: float = 0.10
+    light: float = 0.25
+    ambient: float = 0.15
+    light_deg: float = 25.0
+    camera: float = 0.003
+    camera_deg: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InvalidInput(f"{field.name}: expected a finite number >= 0, got {value}")
+
+
+def vary_appearance(
+    robot: RobotSpec,
+    scene: SceneSpec,
+    rng: np.random.Generator,
+    config: AppearanceConfig | None = None,
+) -> tuple[RobotSpec, SceneSpec]:
+    """The same robot and scene with looks drawn at random: what moves, and how, stays the same.
+
+    Colours of the scene's bodies, the light, and the wrist camera's pose vary; robot and held
+    bodies keep their colours. Saved states of the one scene can be restored in the other.
+
+    Args:
+        robot: the robot whose camera varies.
+        scene: the scene whose bodies and light vary.
+        rng: source of randomness.
+        config: how far.
+    """
+    config = config or AppearanceConfig()
+    bodies = tuple(
+        dataclasses.replace(body, shapes=_recoloured(body, rng, config.colour))
+        for body in scene.bodies
+    )
+    light = dataclasses.replace(
+        scene.light,
+        direction=_turn(rng, config.light_deg) @ scene.light.direction,
+        intensity=scene.light.intensity * (1 + rng.uniform(-config.light, config.light)),
+        ambient=scene.light.ambient * (1 + rng.uniform(-config.ambient, config.ambient)),
+    )
+    camera = _remounted(robot.wrist_camera, rng, config)
+    return (
+        dataclasses.replace(robot, wrist_camera=camera),
+        dataclasses.replace(scene, bodies=bodies, light=light),
+    )
+
+
+def _recoloured(body: Body, rng: np.random.Generator, spread: float) -> tuple[Shape, ...]:
+    """The body's shapes; those of one colour get one other colour."""
+    changed = {}
+    for rgba in _in_order(shape.rgba for shape in body.shapes):
+        rgb = np.clip(np.array(rgba[:3]) + rng.uniform(-spread, spread, 3), 0.0, 1.0)
+        changed[rgba] = (float(rgb[0]), float(rgb[1]), float(rgb[2]), rgba[3])
+    return tuple(dataclasses.replace(shape, rgba=changed[shape.rgba]) for shape in body.shapes)
+
+
+def _in_order(
+    colours: Iterable[tuple[float, float, float, float]],
+) -> list[tuple[float, float, float, float]]:
+    return list(dict.fromkeys(colours))
+
+
+def _remounted(
+    camera: CameraSpec, rng: np.random.Generator, config: AppearanceConfig
+) -> CameraSpec:
+    T = np.array(camera.T_frame_camera)
+    T[:3, 3] += rng.uniform(-config.camera, config.camera, 3)
+    T[:3, :3] = orthonormalised(T[:3, :3] @ _turn(rng, config.camera_deg))
+    return dataclasses.replace(camera, T_frame_camera=T)
+
+
+def _turn(rng: np.random.Generator, degrees: float) -> Array:
+    """A rotation `(3, 3)` about each axis by up to so many degrees."""
+    return exp_rotation(np.deg2rad(rng.uniform(-degrees, degrees, 3)))

@@ -1,1 +1,0 @@
-"""Teaching: teleoperation and its recorder, scripted operators, and radius suggestion."""

@@ -1,0 +1,53 @@
+"""The comparison of radii from pictures and from the scene counts what it finds."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from sart_toolkit.annotate.suggest import ExactSurroundings
+from sart_toolkit.backends import make_backend
+from sart_toolkit.benchmark.clouds import _on_robot, benchmark_clouds
+from sart_toolkit.benchmark.operator import Cell
+from sart_toolkit.robots import get_robot
+from sart_toolkit.tasks import get_task
+
+
+@pytest.fixture(scope="module")
+def compared():
+    task = get_task("peg_in_hole")
+    make = functools.partial(make_backend, "pybullet", get_robot(task.robot), task.scene, 96)
+    seen = []
+    found = benchmark_clouds(
+        [Cell(task, "pybullet", make)], progress=lambda done, wanted: seen.append((done, wanted))
+    )
+    assert seen == [(1, 1)]
+    return found
+
+
+def test_radii_of_both_sources_stand_side_by_side(compared):
+    row = compared["cells"]["peg_in_hole/pybullet"]
+    assert compared["total"]["n_spheres"] == len(row["spheres"]) == row["n_spheres_exact"] >= 2
+    shares = sorted(sphere["cloud"] / sphere["exact"] for sphere in row["spheres"])
+    assert shares[0] <= row["median_share"] <= shares[-1]
+    assert row["largest_excess_mm"] == pytest.approx(
+        max(1e3 * (sphere["cloud"] - sphere["exact"]) for sphere in row["spheres"])
+    )
+    assert row["spheres"][0]["cloud_limited_by"] == "peg / cloud"
+    assert row["seconds_exact"] > 0 and row["seconds_cloud"] > 0
+
+
+def test_the_cloud_s_points_lie_on_true_surfaces(compared):
+    errors = compared["cells"]["peg_in_hole/pybullet"]["surface_errors"]
+    assert errors["points"] > 1000
+    assert errors["median_mm"] <= errors["p95_mm"] <= errors["max_mm"]
+    assert errors["median_mm"] < 3 and errors["p95_mm"] < 8
+    assert errors["on_robot"] == 0
+
+
+def test_a_point_on_the_robot_is_counted(peg_demonstration, peg_scene):
+    scene = ExactSurroundings(peg_scene)
+    Ts = peg_demonstration.steps.measured_Ts_world_tool[:, :3, 3]
+    points = np.array([Ts[0], Ts[-1], [0.0, 2.0, 0.0]])
+    assert _on_robot(points, scene, peg_demonstration, range(len(Ts))) == 2
+    assert _on_robot(points, scene, peg_demonstration, range(1)) == 1

@@ -1,0 +1,235 @@
+"""The benchmark of segments counts honestly, goes on, and finds faults that are planted."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.execution import Attempt, SegmentPlanner
+from sart_toolkit.benchmark.operator import Cell
+from sart_toolkit.benchmark.segments import (
+    SegmentsConfig,
+    benchmark_segments,
+    check_motion,
+    tool_off_path,
+)
+from sart_toolkit.cli import main
+from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
+from sart_toolkit.evaluate import segments
+from sart_toolkit.motion import timing
+from sart_toolkit.motion.timing import Motion
+from sart_toolkit.poses import Array
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks.peg_in_hole import PegInHole
+from sart_toolkit.tasks.task import Stage, Task
+
+PEG = "peg_in_hole/pybullet"
+LID = "lid_closing/pybullet"
+
+
+class Interrupted(Exception):
+    pass
+
+
+class LazyPeg(PegInHole):
+    """An operator that never goes down."""
+
+    def plan(self, state: Any) -> list[Stage]:
+        T = super().plan(state)[0].T_world_tool
+        return [Stage(T, state.gripper, 0.1)]
+
+
+def counted(result: dict[str, Any]) -> Any:
+    """The figures that depend neither on the machine's speed nor on coal's last digits."""
+    rows = {
+        name: {key: row[key] for key in ("spheres", "alarms", "rejections", "certified", "kept")}
+        for name, row in result["cells"].items()
+    }
+    return json.loads(json.dumps(rows))
+
+
+def test_segments_are_tallied_by_sphere_and_their_motions_checked(
+    tmp_path: Path, peg_cell: Cell
+) -> None:
+    calls: list[tuple[int, int, int]] = []
+    result = benchmark_segments(
+        [peg_cell], SegmentsConfig(8), tmp_path / "out.json",
+        progress=lambda *args: calls.append(args), about={"command": "sart"},
+    )  # fmt: skip
+    row = result["cells"][PEG]
+    assert (row["attempted"], row["certified"], row["kept"], row["contacts"]) == (8, 8, 8, 0)
+    assert row["ci95"][0] < 1.0 == row["kept_rate"]
+    assert (row["left_path"], row["rejections"], row["alarms"]) == (0, {}, [])
+    assert row["limits"]["motions_that_violate"] == 0
+    for name in ("velocity", "acceleration", "jerk"):
+        assert 0.01 < row["limits"]["greatest_ratio"][name] <= 1.0
+    assert 0.0 < row["commands_off_path_mm"]["median"] <= row["commands_off_path_mm"]["max"] < 0.2
+    assert 0.0 < row["measured_off_path_mm"]["max"] < 0.2
+    assert row["least_clearance_mm"] >= AugmentConfig().margin * 1e3
+    assert row["least_measured_clearance_mm"] >= 0.0
+    assert sum(sphere["attempted"] for sphere in row["spheres"]) == 8
+    assert max(s["attempted"] for s in row["spheres"]) <= 1 + min(
+        s["attempted"] for s in row["spheres"]
+    )
+    assert calls[-1] == (8, 8, 8)
+    written = json.loads((tmp_path / "out.json").read_text())
+    assert (written["cells"], written["command"]) == (result["cells"], "sart")
+    assert [path.name for path in tmp_path.iterdir()] == ["out.json"]
+
+
+def test_contacts_and_paths_that_were_left_are_told_apart_from_other_rejections(
+    tmp_path: Path, peg_cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcomes = ["contact peg / block", "left its path peg / block", "peg slipped in the grasp"]
+
+    class Unlucky:
+        def __init__(self, *args: Any) -> None:
+            self.left = iter(outcomes)
+
+        def __call__(self, sphere: int, k: int) -> Attempt:
+            return Attempt(next(self.left), None)
+
+    monkeypatch.setattr(segments, "SegmentMaker", Unlucky)
+    result = benchmark_segments([peg_cell], SegmentsConfig(3), tmp_path / "out.json")
+    for row in (result["total"], result["cells"][PEG]):
+        assert row["rejections"] == dict.fromkeys(outcomes, 1)
+        assert (row["kept"], row["contacts"], row["left_path"]) == (0, 1, 1)
+        assert row["measured_off_path_mm"] == {"median": None, "max": None}
+    row = result["cells"][PEG]
+    assert [(a["sphere"], a["k"], a["outcome"]) for a in row["alarms"]] == [
+        (0, 0, outcomes[0]), (1, 0, outcomes[1])
+    ]  # fmt: skip
+    assert [sphere["rejections"] for sphere in row["spheres"]] == [{o: 1} for o in outcomes]
+
+
+def test_a_law_that_heeds_no_limits_is_found(
+    tmp_path: Path, peg_cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    law = timing._law
+
+    def hasty(path: Any, spec: RobotSpec, duration: float) -> Any:
+        names = ("velocity_limits", "acceleration_limits", "jerk_limits")
+        loose = {name: 1e6 * getattr(spec, name) for name in names}
+        return law(path, dataclasses.replace(spec, **loose), 0.1 * duration)
+
+    monkeypatch.setattr(timing, "_law", hasty)
+    result = benchmark_segments([peg_cell], SegmentsConfig(1), tmp_path / "out.json")
+    row = result["cells"][PEG]
+    assert row["limits"]["motions_that_violate"] == 1 == len(row["alarms"])
+    assert row["limits"]["greatest_ratio"]["jerk"] > 1.0
+
+
+def test_interrupted_segments_go_on_where_they_were(tmp_path: Path, peg_cell: Cell) -> None:
+    def stop(done: int, wanted: int, kept: int) -> None:
+        if done == 3:
+            raise Interrupted
+
+    out, config = tmp_path / "out.json", SegmentsConfig(5, seed=1)
+    with pytest.raises(Interrupted):
+        benchmark_segments([peg_cell], config, out, progress=stop)
+    with pytest.raises(Mismatch, match="add --overwrite"):
+        benchmark_segments([peg_cell], SegmentsConfig(5), out)
+    calls: list[int] = []
+    again = benchmark_segments(
+        [peg_cell], config, out, progress=lambda done, *_: calls.append(done)
+    )
+    assert calls == [4, 5]
+    whole = benchmark_segments([peg_cell], config, tmp_path / "whole.json", workers=2)
+    assert counted(again) == counted(whole)
+    with pytest.raises(OutputExists):
+        benchmark_segments([peg_cell], config, out)
+
+
+def test_tries_are_shared_by_the_cells(
+    tmp_path: Path, peg_cell: Cell, make_cell: Callable[[Task], Cell]
+) -> None:
+    result = benchmark_segments(
+        [peg_cell, make_cell(get_task("lid_closing"))], SegmentsConfig(3), tmp_path / "out.json"
+    )
+    assert [result["cells"][name]["attempted"] for name in (PEG, LID)] == [2, 1]
+    assert result["total"]["attempted"] == 3
+    with pytest.raises(InvalidInput, match="expected at least 2, got 1"):
+        benchmark_segments([peg_cell, peg_cell], SegmentsConfig(1), tmp_path / "few.json")
+
+
+def test_a_demonstration_that_fails_is_refused(
+    tmp_path: Path, make_cell: Callable[[Task], Cell]
+) -> None:
+    with pytest.raises(Mismatch, match="did not reach the goal"):
+        benchmark_segments([make_cell(LazyPeg())], SegmentsConfig(1), tmp_path / "out.json")
+
+
+@pytest.fixture(scope="module")
+def wide_motion(
+    peg_task: Task, peg_demonstration: Demonstration, peg_annotation: Annotation
+) -> tuple[Motion, Array]:
+    """A motion from the widest sphere, and the joints that it starts from."""
+    planner = SegmentPlanner(
+        get_robot(peg_task.robot), peg_task.scene, peg_demonstration, peg_annotation,
+        AugmentConfig(camera=None),
+    )  # fmt: skip
+    proposal, rng = planner.proposal(0, 0)
+    q_start = peg_demonstration.steps.commanded_joint_positions[proposal.t_star]
+    return planner.plan(proposal, rng)[0], q_start
+
+
+def test_ratios_are_those_of_finite_differences(
+    peg_model: RobotModel, wide_motion: tuple[Motion, Array]
+) -> None:
+    motion, q_start = wide_motion
+    found = check_motion(peg_model, motion, q_start)
+    dt = 1e-4
+    q = motion.joints(np.arange(0.0, motion.duration, dt))
+    spec = peg_model.spec
+    for order, limits in ((1, spec.velocity_limits), (2, spec.acceleration_limits)):
+        expected = (np.abs(np.diff(q, order, axis=0)) / dt**order / limits).max()
+        assert found.ratios[order - 1] == pytest.approx(expected, rel=0.02)
+
+
+def test_the_tool_s_distance_from_the_path_is_measured(
+    peg_model: RobotModel, wide_motion: tuple[Motion, Array]
+) -> None:
+    motion, _ = wide_motion
+    on_path = motion.joints(np.linspace(0.3, 1.7, 50))
+    assert tool_off_path(peg_model, motion, on_path) < 1e-6
+    T = motion.T_world_tool(1.0)
+    along = motion.T_world_tool(1.1)[:3, 3] - motion.T_world_tool(0.9)[:3, 3]
+    across = np.cross(along, [0.0, 0.0, 1.0])
+    T[:3, 3] += 0.003 * across / np.linalg.norm(across)
+    q = peg_model.ik(T, motion.joints(np.array([1.0]))[0])
+    assert tool_off_path(peg_model, motion, q[None]) == pytest.approx(0.003, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: SegmentsConfig(count=0), "count: expected at least 1"),
+        (lambda: SegmentsConfig(seed=-1), "seed: expected a whole number"),
+    ],
+)
+def test_bad_numbers_are_refused(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        make()
+
+
+def test_the_command_line_prints_a_line_for_each_cell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.json"
+    task = ["--tasks", "peg_in_hole", "--backends", "pybullet", "--workers", "1", "--json"]
+    main(["benchmark", "segments", *task, "--count", "2", "--out", str(out)])
+    result = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert set(result) == {"benchmark", PEG, "all"}
+    assert "2/2 kept" in result[PEG]
+    assert {"command", "machine", "versions", "config"} <= set(json.loads(out.read_text()))

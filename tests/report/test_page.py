@@ -1,0 +1,322 @@
+from __future__ import annotations
+
+import base64
+import re
+import shutil
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sart_toolkit.data.records import Demonstration
+from sart_toolkit.errors import BrokenFile, CannotWrite, Mismatch, MissingFile
+from sart_toolkit.evaluate import report
+from sart_toolkit.report.figures import film_strip
+from sart_toolkit.report.page import Markup, duration, element, join, percent, write_report
+
+EditJson = Callable[[Path, dict[str, Any]], None]
+VOID = {"img", "source", "meta"}
+HOSTILE = "<script>alert(1)</script>\"' onload='x' https://evil.example/"
+
+
+class Page(HTMLParser):
+    """A page's elements with their attributes, its text, and whether every element is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.words: list[str] = []
+        self.open: list[str] = []
+        self.source = text
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {key: value or "" for key, value in attrs}))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1:] != ["style"]:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join("".join(self.words).split())
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def written(run_dir: Path) -> Page:
+    out = run_dir / "report.html"
+    write_report(run_dir, out)
+    page = Page(out.read_text())
+    assert page.open == []
+    return page
+
+
+@pytest.fixture(autouse=True)
+def _quick_drawings(monkeypatch: pytest.MonkeyPatch, small_png: bytes) -> None:
+    """Drawings are tested beside; only `page`, made before this, shows real ones."""
+    for name in ("scene_picture", "training_curve", "placement_picture"):
+        monkeypatch.setattr(report, name, lambda *_: small_png)
+
+
+@pytest.fixture(scope="module")
+def small_png(demonstration: Demonstration) -> bytes:
+    return film_strip(demonstration, n=2, size=32)
+
+
+@pytest.fixture(scope="module")
+def page(_finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    out = tmp_path_factory.mktemp("report") / "report.html"
+    write_report(_finished_run, out)
+    return Page(out.read_text())
+
+
+def test_page_asks_nothing_of_any_network(page: Page) -> None:
+    for _, attributes in page.elements:
+        for name in ("src", "href", "srcset", "poster", "action", "data"):
+            assert attributes.get(name, "data:").startswith("data:")
+    assert not page.all("script") and not page.all("link") and not page.all("iframe")
+    assert "url(" not in page.source and "@import" not in page.source
+    assert re.search(r"https?://", page.source) is None
+    policies = [m["content"] for m in page.all("meta") if "http-equiv" in m]
+    assert len(policies) == 1 and policies[0].startswith("default-src 'none'")
+
+
+def test_page_carries_its_pictures_and_videos(page: Page, _finished_run: Path) -> None:
+    videos = [v["src"] for v in page.all("video")]
+    expected = [
+        (_finished_run / "videos" / f"{name}_000.mp4").read_bytes()
+        for name in ("success", "failure")
+    ]
+    assert [base64.b64decode(v.removeprefix("data:video/mp4;base64,")) for v in videos] == expected
+    images = page.all("img")
+    assert len(images) == 4
+    for image in images:
+        assert image["src"].startswith("data:image/png;base64,iVBOR")
+        assert len(image["alt"]) > 20
+        assert int(image["width"]) > 300 and int(image["height"]) > 100
+    darker = [source["media"] for source in page.all("source")]
+    assert darker == ["screen and (prefers-color-scheme: dark)"] * 3
+
+
+def test_page_is_readable_on_any_screen_and_by_screen_readers(page: Page) -> None:
+    assert page.all("html") == [{"lang": "en"}]
+    assert any(m.get("name") == "viewport" for m in page.all("meta"))
+    assert len(page.all("h1")) == 1
+    assert all("aria-label" in v and "controls" in v for v in page.all("video"))
+    roles = [a for _, a in page.elements if "role" in a]
+    assert roles and all(a["aria-label"] for a in roles)
+    assert all(th.get("scope") == "col" for th in page.all("th"))
+
+
+def test_page_tells_the_figures(page: Page) -> None:
+    for words in (
+        "peg_in_hole",
+        "18 / 20",
+        "90 %, Wilson 95 % interval 64 % to 95 %",
+        "4.2 s demonstrating, by scripted operator",
+        "no annotating: radii suggested by the toolkit",
+        "4 min 50 s",
+        "12 of 15 attempted trajectories were kept (80 %)",
+        "path too close peg / block",
+        "by at least 1",
+        "80.0 mm",
+        "gripper - table",
+        "compact_mlp was trained for 12 epochs",
+        "18 of 20 rollouts succeeded.",
+        "time limit: peg beside the hole",
+        "Table of 20 episodes",
+        "3 min 32 s",
+        "sart run peg_in_hole --out run",
+        "2.13.0",
+    ):
+        assert words in page.text
+
+
+def test_every_rollout_is_in_the_table(page: Page) -> None:
+    outcomes = [a["class"] for tag, a in page.elements if tag == "span" and "badge" in str(a)]
+    # Two of the badges belong to the videos.
+    assert outcomes.count("badge success") == 19
+    assert outcomes.count("badge failure") == 3
+
+
+def test_same_run_gives_the_same_page(run_dir: Path) -> None:
+    assert written(run_dir).source == written(run_dir).source
+
+
+@pytest.mark.parametrize(
+    ("missing", "note"),
+    [
+        ("demo.h5", "No demo.h5 in this run: nothing was recorded yet."),
+        ("annotation.json", "No annotation.json in this run"),
+        ("dataset", "No finished dataset in this run"),
+        ("dataset/dataset.json", "No finished dataset in this run"),
+        ("skill", "No skill/training.json in this run"),
+        ("evaluation.json", "the skill was not evaluated yet"),
+        ("run.json", "No run.json in this run"),
+        ("videos/success_000.mp4", "Left out: videos/success_000.mp4 is not there."),
+    ],
+)
+def test_missing_part_leaves_a_note(run_dir: Path, missing: str, note: str) -> None:
+    path = run_dir / missing
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    assert note in written(run_dir).text
+
+
+def test_one_part_is_enough(run_dir: Path) -> None:
+    for path in run_dir.iterdir():
+        if path.name != "evaluation.json":
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    page = written(run_dir)
+    assert "18 / 20" in page.text
+    assert len(page.all("img")) == 1
+
+
+def test_evaluation_without_videos_or_placements_is_shown(
+    run_dir: Path, edit_json: EditJson
+) -> None:
+    rows = [{"episode": 0, "outcome": "success"}]
+    edit_json(run_dir / "evaluation.json", {"videos": [], "episodes": rows})
+    assert "The evaluation made no videos." in written(run_dir).text
+
+
+def test_demonstration_without_pictures_leaves_a_note(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = report.load_demonstration
+
+    def blind(path: Path) -> Any:
+        demonstration = load(path)
+        object.__setattr__(demonstration.steps, "cameras", {})
+        return demonstration
+
+    monkeypatch.setattr(report, "load_demonstration", blind)
+    (run_dir / "annotation.json").unlink()
+    assert "The demonstration holds no camera pictures." in written(run_dir).text
+
+
+def test_large_videos_are_named_instead_of_carried(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = (run_dir / "videos" / "success_000.mp4").stat().st_size
+    monkeypatch.setattr(report, "MAX_VIDEO_BYTES", size)
+    page = written(run_dir)
+    assert len(page.all("video")) == 1
+    assert "videos/failure_000.mp4 is too large" in page.text
+
+
+def test_human_radii_count_as_human_time(run_dir: Path, edit_json: EditJson) -> None:
+    path = run_dir / "annotation.json"
+    path.write_text(path.read_text().replace('"suggested"', '"human"'))
+    edit_json(path, {"seconds_spent": 30.0})
+    page = written(run_dir)
+    assert "30.0 s annotating" in page.text
+    assert "34.2 s" in page.text
+
+
+def test_hostile_text_stays_text(run_dir: Path, edit_json: EditJson) -> None:
+    evaluation = {
+        "task": HOSTILE,
+        "policy": HOSTILE,
+        "episodes": [
+            {"episode": 0, "seed": HOSTILE, "outcome": "failure", "reason": HOSTILE,
+             "placement": {HOSTILE: {"x": 0.0, "y": 0.0}}, "steps": 3},
+            {"episode": 1, "seed": 1, "outcome": "success"},
+        ],
+        "versions": {HOSTILE: HOSTILE},
+    }  # fmt: skip
+    edit_json(run_dir / "evaluation.json", evaluation)
+    edit_json(run_dir / "run.json", {"command": HOSTILE, "machine": {HOSTILE: HOSTILE}})
+    page = written(run_dir)
+    assert not page.all("script")
+    assert not any("onload" in attributes for _, attributes in page.elements)
+    assert HOSTILE in "".join(page.words)
+    for _, attributes in page.elements:
+        assert attributes.get("src", "data:").startswith("data:")
+
+
+def test_video_outside_the_run_is_refused(run_dir: Path, edit_json: EditJson) -> None:
+    video = {"path": "../../secret.mp4", "episode": 0, "outcome": "success"}
+    edit_json(run_dir / "evaluation.json", {"videos": [video]})
+    with pytest.raises(BrokenFile, match=r"video '../../secret.mp4' lies outside the run"):
+        write_report(run_dir, run_dir / "report.html")
+    assert not (run_dir / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "changes", "error", "message"),
+    [
+        ("evaluation.json", {"ci95": None}, BrokenFile, "holds a value of the wrong type"),
+        ("evaluation.json", {"n_episodes": 0}, BrokenFile, "counts 0 episodes"),
+        ("evaluation.json", {"episodes": [{}]}, BrokenFile, "evaluation.json: has no episode"),
+        ("skill/training.json", {"curve": []}, BrokenFile, "its curve has no epoch"),
+        ("skill/training.json", {"curve": [{}]}, BrokenFile, "training.json: has no epoch"),
+        ("run.json", {"stages": {"train": "long"}}, BrokenFile, "value of the wrong type"),
+        ("annotation.json", {"demonstration_hash": "0"}, Mismatch, "another demonstration"),
+    ],
+)
+def test_damaged_part_is_an_error(
+    run_dir: Path,
+    edit_json: EditJson,
+    file: str,
+    changes: dict[str, Any],
+    error: type[Exception],
+    message: str,
+) -> None:
+    edit_json(run_dir / file, changes)
+    with pytest.raises(error, match=message):
+        write_report(run_dir, run_dir / "report.html")
+
+
+def test_file_that_is_no_json_is_an_error(run_dir: Path) -> None:
+    (run_dir / "evaluation.json").write_text("{")
+    with pytest.raises(BrokenFile, match="not readable as JSON"):
+        write_report(run_dir, run_dir / "report.html")
+
+
+def test_no_run_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(MissingFile, match="no such directory; pass one that `sart run` wrote"):
+        write_report(tmp_path / "nowhere", tmp_path / "report.html")
+    with pytest.raises(MissingFile, match="holds no part of a run"):
+        write_report(tmp_path, tmp_path / "report.html")
+
+
+def test_page_that_can_not_be_written_is_an_error(run_dir: Path) -> None:
+    with pytest.raises(CannotWrite, match="report.html"):
+        write_report(run_dir, run_dir / "run.json" / "report.html")
+
+
+def test_elements_escape_all_but_markup() -> None:
+    assert element("p", "a < b", Markup("<b>c</b>"), title='"&') == (
+        '<p title="&quot;&amp;">a &lt; b<b>c</b></p>'
+    )
+    assert element("video", muted=True, loop=False, aria_label="x", class_="y") == (
+        '<video muted aria-label="x" class="y"></video>'
+    )
+    assert element("img", alt="") == '<img alt="">'
+    assert join(["<", Markup("<")]) == "&lt;<"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (0, "0.0 s"), (9.64, "9.6 s"), (59.96, "1 min 00 s"), (212, "3 min 32 s"),
+        (3599.6, "1 h 00 min"), (7500, "2 h 05 min"),
+    ],
+)  # fmt: skip
+def test_durations_read_naturally(seconds: float, words: str) -> None:
+    assert duration(seconds).replace("\N{NO-BREAK SPACE}", " ") == words
+
+
+def test_shares_read_naturally() -> None:
+    shares = [percent(share).replace("\N{NO-BREAK SPACE}", " ") for share in (0, 0.8, 0.9287, 1)]
+    assert shares == ["0 %", "80 %", "92.9 %", "100 %"]

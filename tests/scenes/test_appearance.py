@@ -1,0 +1,84 @@
+"""Other looks: within what was asked for, the same for a seed, and nothing else changes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.errors import InvalidInput
+from sart_toolkit.poses import distance
+from sart_toolkit.robots import get_robot
+from sart_toolkit.scenes.appearance import AppearanceConfig, vary_appearance
+from sart_toolkit.tasks import TASKS, get_task
+
+
+@pytest.fixture(params=TASKS)
+def task(request):
+    return get_task(request.param)
+
+
+def test_looks_vary_within_what_was_asked_for(task):
+    robot, config = get_robot(task.robot), AppearanceConfig()
+    for seed in range(20):
+        varied, scene = vary_appearance(robot, task.scene, np.random.default_rng(seed))
+        for old, new in zip(task.scene.bodies, scene.bodies, strict=True):
+            colours = np.array([[s.rgba for s in body.shapes] for body in (old, new)])
+            assert np.abs(colours[0] - colours[1]).max() <= config.colour + 1e-12
+            assert (colours >= 0).all() and (colours <= 1).all()
+        light = scene.light
+        assert abs(light.intensity / task.scene.light.intensity - 1) <= config.light
+        assert abs(light.ambient / task.scene.light.ambient - 1) <= config.ambient
+        turned = np.rad2deg(np.arccos(light.direction @ task.scene.light.direction))
+        assert turned <= np.sqrt(3) * config.light_deg
+        cameras = [r.wrist_camera.T_frame_camera for r in (robot, varied)]
+        far, turn = distance(*cameras)
+        assert far <= np.sqrt(3) * config.camera
+        assert 0 < np.rad2deg(turn) <= np.sqrt(3) * config.camera_deg
+
+
+def test_nothing_but_looks_changes_and_shapes_of_one_colour_stay_alike(task):
+    robot = get_robot(task.robot)
+    varied, scene = vary_appearance(robot, task.scene, np.random.default_rng(0))
+    for old, new in zip(task.scene.bodies, scene.bodies, strict=True):
+        shapes = [
+            dataclasses.replace(s, rgba=o.rgba) for s, o in zip(new.shapes, old.shapes, strict=True)
+        ]
+        assert repr(dataclasses.replace(new, shapes=tuple(shapes))) == repr(old)
+        alike = {}
+        for was, now in zip(old.shapes, new.shapes, strict=True):
+            assert alike.setdefault(was.rgba, now.rgba) == now.rgba
+    assert scene.held == task.scene.held
+    assert dataclasses.replace(varied, wrist_camera=robot.wrist_camera) is not varied
+
+
+def test_a_seed_gives_the_same_looks_and_another_seed_others(task):
+    robot = get_robot(task.robot)
+    a, b, c = (
+        vary_appearance(robot, task.scene, np.random.default_rng(seed))[1] for seed in (1, 1, 2)
+    )
+    assert repr(a) == repr(b) != repr(c)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_state_saved_in_plain_looks_is_restored_in_others_and_looks_otherwise(name, peg_task):
+    robot = get_robot(peg_task.robot)
+    plain = make_backend(name, robot, peg_task.scene, 48)
+    varied = make_backend(
+        name, *vary_appearance(robot, peg_task.scene, np.random.default_rng(3)), 48
+    )
+    plain.reset(peg_task.scene.initial_state(robot.home, 0.5))
+    varied.restore(plain.save())
+    a, b = plain.observe(("wrist",)), varied.observe(("wrist",))
+    np.testing.assert_array_equal(a.q, b.q)
+    difference = np.abs(a.cameras["wrist"].rgb.astype(int) - b.cameras["wrist"].rgb)
+    assert difference.mean() > 2
+    plain.close()
+    varied.close()
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(AppearanceConfig)])
+@pytest.mark.parametrize("value", [-0.1, np.nan])
+def test_a_bad_spread_is_refused(name, value):
+    with pytest.raises(InvalidInput, match=f"{name}: expected a finite number >= 0"):
+        AppearanceConfig(**{name: value})
