@@ -26,7 +26,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.execution import SegmentPlanner
+from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.backends import make_backend
 from sart_toolkit.data.records import Annotation, Demonstration, PrecisionSphere
 from sart_toolkit.data.sampling import SamplingConfig

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.execution import KEPT, SegmentMaker
+from sart_toolkit.augment.executors import KEPT, SegmentMaker
 from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.data.records import (
     Annotation,

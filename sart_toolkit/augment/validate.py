@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.execution import SegmentPlanner, path_deviation
+from sart_toolkit.augment.planner import SegmentPlanner, path_deviation
 from sart_toolkit.collision.certificate import Certificate, certify
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.data.records import (

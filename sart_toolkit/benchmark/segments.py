@@ -15,7 +15,8 @@ import numpy as np
 
 from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.execution import KEPT, SegmentMaker, SegmentPlanner
+from sart_toolkit.augment.executors import KEPT, SegmentMaker
+from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.benchmark.operator import Cell
 from sart_toolkit.benchmark.recorded import check_counts, recorded

@@ -15,7 +15,8 @@ import pytest
 from sart_toolkit.augment import engine
 from sart_toolkit.augment.config import SHARES, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.execution import KEPT, Attempt, SegmentMaker, SegmentPlanner
+from sart_toolkit.augment.executors import KEPT, Attempt, SegmentMaker
+from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.strategies import STRATEGIES
 from sart_toolkit.backends.interface import Backend, Capabilities, Contact
 from sart_toolkit.data.records import (
@@ -482,7 +483,8 @@ from pathlib import Path
 from sart_toolkit.augment import engine
 from sart_toolkit.augment.config import SHARES, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.execution import KEPT, Attempt, SegmentMaker, SegmentPlanner
+from sart_toolkit.augment.executors import KEPT, Attempt, SegmentMaker
+from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.backends import make_backend
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel

@@ -8,7 +8,7 @@ import pytest
 
 from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.execution import KEPT, SegmentMaker
+from sart_toolkit.augment.executors import KEPT, SegmentMaker
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.collision.demonstrated import DemonstratedScene
 from sart_toolkit.data.records import Annotation, PrecisionSphere, convergence_waypoint

@@ -17,7 +17,8 @@ from PIL import Image
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.execution import KEPT, SegmentMaker, SegmentPlanner
+from sart_toolkit.augment.executors import KEPT, SegmentMaker
+from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import make_backend
 from sart_toolkit.collision.certificate import certify

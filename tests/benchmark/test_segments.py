@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.execution import Attempt, SegmentPlanner
+from sart_toolkit.augment.executors import Attempt
+from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.benchmark.operator import Cell
 from sart_toolkit.benchmark.segments import (
     SegmentsConfig,

@@ -1,0 +1,90 @@
+"""Draws segments of a demonstration and proves them clear; moves nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.strategies import Proposal, get_strategy
+from sart_toolkit.collision.certificate import Certificate, certify
+from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.errors import MotionRejected, Unreachable
+from sart_toolkit.motion.line import straight_line
+from sart_toolkit.motion.path import nearest_on_polyline
+from sart_toolkit.motion.planning import plan_motion
+from sart_toolkit.motion.timing import Motion
+from sart_toolkit.poses import Array
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.scenes.spec import SceneSpec
+
+_PATH_SAMPLES = 1000
+
+
+class SegmentPlanner:
+    """Draws segments of one demonstration and annotation, and proves them clear; moves nothing."""
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        scene: SceneSpec,
+        demonstration: Demonstration,
+        annotation: Annotation,
+        config: AugmentConfig,
+    ) -> None:
+        """Plan for a robot in the demonstration's scene.
+
+        Raises:
+            Mismatch: the demonstration doesn't tell where the scene's bodies were.
+        """
+        self.scene = DemonstratedScene(demonstration, robot, scene, config.grasp_play)
+        self._annotation, self._config = annotation, config
+
+    def proposal(self, sphere: int, k: int) -> tuple[Proposal, np.random.Generator]:
+        """The k-th draw from a sphere, and the random numbers that follow."""
+        rng = np.random.default_rng([self._config.seed, sphere, k])
+        propose = get_strategy(self._config.strategy)
+        demonstration = self.scene.demonstration
+        at = self._annotation.spheres[sphere]
+        return propose(demonstration, at, rng, self._config.sampling), rng
+
+    def plan(self, proposal: Proposal, rng: np.random.Generator) -> tuple[Motion, Certificate]:
+        """The motion from waypoint t* to a drawn pose, and the proof that it keeps the margin.
+
+        It is the straight line if that is clear; else, where the strategy plans, one round what is
+        in the way.
+
+        Raises:
+            Unreachable: no joint configuration reaches some pose.
+            MotionRejected: the motion can't be proved clear, or a joint forbids it.
+        """
+        config, t = self._config, proposal.t_star
+        steps = self.scene.demonstration.steps
+        placed = self.scene.placed(t)
+        q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
+        T_goal = proposal.T_world_sampled
+        try:
+            motion = straight_line(placed.kinematics, q, T, T_goal, config.duration)
+            certificate = certify(placed, motion.path, config.margin)
+            certificate.check_free()
+        except (Unreachable, MotionRejected):
+            if not get_strategy(config.strategy).plans:
+                raise
+            motion, certificate = plan_motion(
+                placed, q, T_goal, config.duration, config.margin, rng
+            )
+        return motion, certificate
+
+
+def path_deviation(placed: PlacedModel, motion: Motion, joint_path: Array) -> float:
+    """How far [m] any point of the robot was, at most, from where the motion's path has it.
+
+    Each measured configuration of `joint_path (m, n)` is compared with the nearest of the path:
+    sum_j R_j |dq_j|, R_j being the farthest that a point of the robot can be from joint j.
+    """
+    # In these units of length all joints count alike.
+    reach = placed.bounds.reach.max(0, initial=0.0)
+    on_path = motion.path.positions(np.linspace(0.0, 1.0, _PATH_SAMPLES)) * reach
+    measured = joint_path * reach
+    return float(np.abs(measured - nearest_on_polyline(measured, on_path)).sum(1).max())
