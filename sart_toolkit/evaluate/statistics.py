@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import operator
 
-from scipy.special import ndtri
+from scipy.stats import binomtest
 
 from sart_toolkit.errors import InvalidInput
 
@@ -13,10 +12,9 @@ from sart_toolkit.errors import InvalidInput
 def wilson_interval(n_success: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
     """The Wilson score interval (low, high) in [0, 1] of a success probability.
 
-    With p = n_success / n and z the normal quantile at (1 + confidence) / 2, its ends are
-    (p + z^2/2n -+ z sqrt(p (1-p)/n + z^2/4n^2)) / (1 + z^2/n): Wilson, "Probable inference, the
-    law of succession, and statistical inference", J. Am. Stat. Assoc. 22 (1927). Unlike p +- z
-    times the standard error it stays in [0, 1], and says something when every trial succeeded.
+    Wilson, "Probable inference, the law of succession, and statistical inference", J. Am. Stat.
+    Assoc. 22 (1927). Unlike p +- z times the standard error it stays in [0, 1], and says something
+    when every trial succeeded.
 
     Args:
         n_success: trials that succeeded.
@@ -34,15 +32,8 @@ def wilson_interval(n_success: int, n: int, confidence: float = 0.95) -> tuple[f
         raise InvalidInput(f"n_success: expected between 0 and n = {n}, got {n_success}")
     if not 0.0 < confidence < 1.0:
         raise InvalidInput(f"confidence: expected between 0 and 1, such as 0.95, got {confidence}")
-    z = float(ndtri(0.5 + 0.5 * confidence))
-    p = n_success / n
-    centre = p + z * z / (2 * n)
-    spread = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    scale = 1 + z * z / n
-    # At the two ends the equation gives exactly 0 and 1, which rounding would miss.
-    low = 0.0 if n_success == 0 else (centre - spread) / scale
-    high = 1.0 if n_success == n else (centre + spread) / scale
-    return low, high
+    interval = binomtest(n_success, n).proportion_ci(confidence, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def _whole(name: str, value: int) -> int:
