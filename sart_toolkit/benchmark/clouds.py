@@ -17,7 +17,7 @@ from sart_toolkit.annotate.suggest import (
     suggest_annotation,
     suggest_radius,
 )
-from sart_toolkit.benchmark.operator import Cell
+from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.collision.cloud import fuse_cloud, surface_errors
 from sart_toolkit.collision.demonstrated import DemonstratedScene
 from sart_toolkit.collision.hull import Hull

@@ -1,45 +1,23 @@
-"""How well the scripted operator does on each task and backend, and how alike the backends are."""
+"""How well the scripted operator does on each task and backend."""
 
 from __future__ import annotations
 
 import functools
-import itertools
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sart_toolkit.backends.interface import Backend, BackendFactory
+from sart_toolkit.benchmark.cells import BLIND, Cell, check_counts, demonstrate
 from sart_toolkit.benchmark.result_log import ResultLog
-from sart_toolkit.data.records import Demonstration, library_versions
-from sart_toolkit.errors import InvalidInput, SartError
+from sart_toolkit.data.records import library_versions
+from sart_toolkit.errors import SartError
 from sart_toolkit.evaluate.statistics import wilson_interval
-from sart_toolkit.record.replay import replay_demonstration, tracking_difference
-from sart_toolkit.record.scripted import ScriptedOperator
-from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.workers import worker_map
-
-_BLIND = SessionConfig(cameras=(), keep_states=False)
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A task on a backend."""
-
-    task: Task
-    backend: str
-    make_backend: BackendFactory
-
-    @property
-    def name(self) -> str:
-        """Both names, as the results have them."""
-        return f"{self.task.name}/{self.backend}"
 
 
 @dataclass(frozen=True)
@@ -51,10 +29,7 @@ class BenchmarkConfig:
     yaw_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise InvalidInput(f"episodes: expected at least 1, got {self.episodes}")
-        if self.seed < 0:
-            raise InvalidInput(f"seed: expected a whole number >= 0, got {self.seed}")
+        check_counts(self, "episodes")
 
 
 class _Operator:
@@ -79,7 +54,7 @@ class _Operator:
         started = time.perf_counter()
         row = {"cell": name, "episode": episode, "placement": placement.to_json()}
         try:
-            shown = _shown(cell.task, backend, model, placement, rng)
+            shown = demonstrate(cell.task, backend, model, placement, rng, BLIND)
             success = cell.task.achieved(shown.success)
             row |= {
                 "success": success,
@@ -164,72 +139,3 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             if not row["success"]
         ],
     }
-
-
-def benchmark_replay(
-    cells: Sequence[Cell],
-    seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> dict[str, Any]:
-    """What a demonstration's commands do on every other backend, object placed the same.
-
-    For each task a demonstration is recorded on each of its backends and replayed on the others.
-    Rows tell the greatest difference of the measured tool poses over all recorded steps at which
-    neither run's robot, or what it carries, touched anything else.
-
-    Args:
-        cells: tasks on backends.
-        seed: of placement and operator.
-        progress: called with (done, wanted) after each replay.
-
-    Raises:
-        InvalidInput: no task has two backends.
-    """
-    pairs = [(a, b) for a, b in itertools.permutations(cells, 2) if a.task.name == b.task.name]
-    if not pairs:
-        raise InvalidInput("replay: needs two backends to compare, got one; name another")
-    shown: dict[str, Demonstration] = {}
-    rows = []
-    for done, (source, target) in enumerate(pairs, 1):
-        task = source.task
-        rng = np.random.default_rng([seed, 0])
-        placement = task.sample_placement(rng)
-        if source.name not in shown:
-            with closing(source.make_backend()) as backend:
-                model = RobotModel(backend.robot, backend.scene.held)
-                shown[source.name] = _shown(task, backend, model, placement, rng)
-        original = shown[source.name]
-        with closing(target.make_backend()) as backend:
-            model = RobotModel(backend.robot, backend.scene.held)
-            copy = replay_demonstration(original, backend, task, model, _BLIND)
-            far, turn, compared = tracking_difference(
-                original, copy, backend.scene, backend.robot.gripper.finger_links
-            )
-            reason = task.shortfall(backend.observe())
-        success = task.achieved(copy.success)
-        rows.append(
-            {
-                "task": task.name,
-                "recorded_on": source.backend,
-                "replayed_on": target.backend,
-                "placement": placement.to_json(),
-                "recorded_success": task.achieved(original.success),
-                "replayed_success": success,
-                "reason": None if success else reason,
-                "tool_difference_mm": far * 1e3,
-                "tool_difference_deg": float(np.rad2deg(turn)),
-                "steps": len(original),
-                "steps_compared": compared,
-            }
-        )
-        if progress is not None:
-            progress(done, len(pairs))
-    return {"seed": seed, "replays": rows, "versions": library_versions()}
-
-
-def _shown(
-    task: Task, backend: Backend, model: RobotModel, placement: Placement, rng: np.random.Generator
-) -> Demonstration:
-    """The scripted operator's demonstration, without pictures."""
-    operator = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
-    return record_demonstration(backend, task, model, operator, placement, config=_BLIND)

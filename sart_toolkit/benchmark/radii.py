@@ -14,8 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sart_toolkit.annotate.suggest import ExactSurroundings, SuggestConfig, suggest_annotation
-from sart_toolkit.benchmark.operator import Cell
-from sart_toolkit.benchmark.recorded import check_counts, recorded
+from sart_toolkit.benchmark.cells import Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision.demonstrated import DemonstratedScene
 from sart_toolkit.collision.model import PlacedModel, coal_transform, convex_distance

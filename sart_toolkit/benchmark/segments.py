@@ -18,8 +18,7 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import KEPT, SegmentMaker
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.benchmark.operator import Cell
-from sart_toolkit.benchmark.recorded import check_counts, recorded
+from sart_toolkit.benchmark.cells import Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision.demonstrated import DemonstratedScene
 from sart_toolkit.data.records import (

@@ -22,14 +22,11 @@ from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import BackendFactory
+from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.benchmark.clouds import benchmark_clouds
-from sart_toolkit.benchmark.operator import (
-    BenchmarkConfig,
-    Cell,
-    benchmark_operator,
-    benchmark_replay,
-)
+from sart_toolkit.benchmark.operator import BenchmarkConfig, benchmark_operator
 from sart_toolkit.benchmark.radii import RadiiConfig, benchmark_radii
+from sart_toolkit.benchmark.replay import benchmark_replay
 from sart_toolkit.benchmark.segments import SegmentsConfig, benchmark_segments
 from sart_toolkit.cli.annotate import (
     annotate_verb,
@@ -82,6 +79,7 @@ from sart_toolkit.record.devices.manual import ManualDevice
 from sart_toolkit.record.session import DeviceSetup, SessionConfig, record_demonstration
 from sart_toolkit.report.page import write_report
 from sart_toolkit.report.player import SceneView
+from sart_toolkit.report.video import film_rollout
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.appearance import vary_appearance
@@ -309,8 +307,9 @@ def evaluate_verb(args: Evaluate) -> Result:
             bar.update(done - bar.n)
 
         result = evaluate_skill(
-            args.skill, task, make, config, args.out, args.workers, args.device, progress
-        )
+            args.skill, task, make, config, args.out, args.workers, args.device, progress,
+            film_rollout if config.videos else None,
+        )  # fmt: skip
     return {"evaluation": str(args.out), **_without_rows(result)}
 
 

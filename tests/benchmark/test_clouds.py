@@ -7,8 +7,8 @@ import pytest
 
 from sart_toolkit.annotate.suggest import ExactSurroundings
 from sart_toolkit.backends import make_backend
+from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.benchmark.clouds import _on_robot, benchmark_clouds
-from sart_toolkit.benchmark.operator import Cell
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks import get_task
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sart_toolkit.benchmark.operator import Cell
+from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.benchmark.radii import RadiiConfig, SphereTrial, benchmark_radii
 from sart_toolkit.cli import main
 from sart_toolkit.collision.demonstrated import DemonstratedScene
