@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from sart_toolkit.record.scripted import ScriptedOperator
     from sart_toolkit.record.session import record_demonstration
     from sart_toolkit.report.page import write_report
+    from sart_toolkit.report.video import film_rollout
     from sart_toolkit.robots import get_robot
     from sart_toolkit.robots.model import RobotModel
     from sart_toolkit.scenes.appearance import vary_appearance
@@ -53,6 +54,7 @@ _HOMES = {
     "augment_demonstration": "augment.engine",
     "certify": "collision.certificate",
     "evaluate_skill": "evaluate.rollout",
+    "film_rollout": "report.video",
     "get_robot": "robots",
     "get_task": "tasks",
     "load_annotation": "data.storage",
@@ -86,6 +88,7 @@ __all__ = [
     "augment_demonstration",
     "certify",
     "evaluate_skill",
+    "film_rollout",
     "get_robot",
     "get_task",
     "load_annotation",

@@ -1,14 +1,15 @@
-"""Seeded rollouts of a skill, what came of each, and videos of the first of either outcome."""
+"""Seeded rollouts of a skill, what came of each, and the first of either outcome for a film."""
 
 from __future__ import annotations
 
 import functools
+import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -26,18 +27,34 @@ from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.learn.skill import Skill, load_skill
 from sart_toolkit.motion.controller import ToolController
-from sart_toolkit.report.video import Outcome, caption, inset, write_video
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.appearance import vary_appearance
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.workers import worker_map
 
 _OVERVIEW, _VIDEO_SIZE = "overview", 384
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A step of a rollout as cameras saw it: from outside, from the wrist, `seconds` after the
+    start, and whether the goal was reached then.
+    """
+
+    overview: Image
+    wrist: Image
+    seconds: float
+    success: bool
+
+
+# Makes a film, at a path, of a rollout's moments, its number and its outcome.
+Film = Callable[[Path, Sequence[Moment], int, Literal["success", "failure"]], object]
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """How a skill is tried: number of rollouts, their seed, and how many videos of each outcome.
+    """How a skill is evaluated: number of rollouts, their seed, how many of each outcome to film.
 
     `yaw_deg`: objects are also turned, uniformly within ± this [deg]; with `vary_looks` colours,
     light and camera mounting differ from rollout to rollout (`AppearanceConfig`'s defaults).
@@ -45,7 +62,7 @@ class EvaluateConfig:
 
     episodes: int = 50
     eval_seed: int = 1000
-    videos: int = 2
+    videos: int = 0
     yaw_deg: float = 0.0
     vary_looks: bool = False
 
@@ -195,8 +212,9 @@ def evaluate_skill(
     workers: int = 1,
     device: str = "cpu",
     progress: Callable[[int, int, int], None] | None = None,
+    film: Film | None = None,
 ) -> dict[str, Any]:
-    """Try a skill on random placements; the result as in `evaluation.json`.
+    """Evaluate a skill on random placements; the result as in `evaluation.json`.
 
     Args:
         skill_directory: the trained skill.
@@ -207,13 +225,19 @@ def evaluate_skill(
         workers: processes.
         device: where the policy runs.
         progress: called with (done, wanted, successes) after each rollout.
+        film: makes the videos, such as `report.video.film_rollout`.
 
     Raises:
         MissingFile, BrokenFile: the skill can't be read.
-        InvalidInput: `workers` is not positive.
+        InvalidInput: `workers` is not positive, or videos are wanted without `film` or `out`.
         CannotWrite: the disk refuses.
     """
     config = config or EvaluateConfig()
+    if config.videos and (film is None or out is None):
+        raise InvalidInput(
+            f"videos: expected 0 without `film` and `out`, got {config.videos}; pass "
+            "film=sart_toolkit.film_rollout and where to write"
+        )
     skill = load_skill(skill_directory)
     make_worker = functools.partial(
         _Worker,
@@ -236,7 +260,8 @@ def evaluate_skill(
     with closing(make_worker(None)) as worker:
         result = _summary(rollouts, skill, task, worker.backend.name, config, seconds)
         if out is not None:
-            result["videos"] = _videos(rollouts, worker, config, out.parent)
+            if film is not None and config.videos:
+                result["videos"] = _videos(rollouts, worker, config, out.parent, film)
             write_json(out, result)
     return result
 
@@ -273,29 +298,29 @@ def _summary(
 
 
 def _videos(
-    rollouts: list[Rollout], worker: _Worker, config: EvaluateConfig, directory: Path
+    rollouts: list[Rollout], worker: _Worker, config: EvaluateConfig, directory: Path, film: Film
 ) -> list[dict[str, Any]]:
-    """Run the first successes and failures again, drawn from outside with the wrist view inset."""
+    """Run the first successes and failures again, seen from outside as well, and film them."""
     if _OVERVIEW not in worker.backend.cameras:
+        _log.warning("no videos: the scene has no camera named %r", _OVERVIEW)
         return []
     rows = []
-    for outcome in get_args(Outcome):
+    outcomes: tuple[Literal["success", "failure"], ...] = ("success", "failure")
+    for outcome in outcomes:
         chosen = [r for r in rollouts if r.success == (outcome == "success")]
         for rollout in chosen[: config.videos]:
-            frames = _film(worker, rollout.episode, outcome)
             name = f"videos/{outcome}_{rollout.episode:03d}.mp4"
-            write_video(directory / name, frames, RECORD_HZ)
+            film(directory / name, _moments(worker, rollout.episode), rollout.episode, outcome)
             rows.append({"path": name, "episode": rollout.episode, "outcome": outcome})
     return rows
 
 
-def _film(worker: _Worker, episode: int, outcome: Outcome) -> list[Image]:
-    frames: list[Image] = []
+def _moments(worker: _Worker, episode: int) -> list[Moment]:
+    moments: list[Moment] = []
 
     def watch(wrist: Image, step: int, success: bool) -> None:
-        view = worker.backend.observe((_OVERVIEW,), _VIDEO_SIZE).cameras[_OVERVIEW].rgb
-        detail = "goal reached" if success else ""
-        frames.append(caption(inset(view, wrist), episode, step / RECORD_HZ, outcome, detail))
+        overview = worker.backend.observe((_OVERVIEW,), _VIDEO_SIZE).cameras[_OVERVIEW].rgb
+        moments.append(Moment(overview, wrist, step / RECORD_HZ, success))
 
     worker(episode, watch)
-    return frames
+    return moments

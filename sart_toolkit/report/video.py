@@ -9,7 +9,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import imageio_ffmpeg
 import matplotlib
@@ -17,10 +17,14 @@ import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
-from sart_toolkit.data.records import Image
+from sart_toolkit.data.records import RECORD_HZ, Image
 from sart_toolkit.data.storage import replacing
 from sart_toolkit.errors import CannotWrite, InvalidInput, MissingExtra
 from sart_toolkit.poses import check_positive
+
+if TYPE_CHECKING:
+    # At run time it would bring torch, which no video needs.
+    from sart_toolkit.evaluate.rollout import Moment
 
 Outcome = Literal["success", "failure"]
 Corner = Literal["top left", "top right", "bottom left", "bottom right"]
@@ -153,6 +157,32 @@ def _ffmpeg() -> str:
             "no ffmpeg for writing videos; run `pip install --force-reinstall imageio-ffmpeg`, or"
             " set IMAGEIO_FFMPEG_EXE to an ffmpeg that has libx264"
         ) from error
+
+
+def film_rollout(path: Path, moments: Iterable[Moment], episode: int, outcome: Outcome) -> None:
+    """Write a rollout's video: seen from outside, the wrist picture inset, a caption below.
+
+    Args:
+        path: the mp4 file.
+        moments: what the cameras saw, 10 times a second, at least one.
+        episode: the rollout's number.
+        outcome: how it ended.
+
+    Raises:
+        InvalidInput: a frame has another size, `path` another suffix.
+        CannotWrite: the disk refuses.
+    """
+    frames = (
+        caption(
+            inset(moment.overview, moment.wrist),
+            episode,
+            moment.seconds,
+            outcome,
+            "goal reached" if moment.success else "",
+        )
+        for moment in moments
+    )
+    write_video(path, frames, RECORD_HZ)
 
 
 # --- composing ----------------------------------------------------------------------------------

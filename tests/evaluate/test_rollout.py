@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -190,7 +191,7 @@ def test_objects_are_turned_and_looks_vary_where_asked_for(evaluate, short_task)
     ):
         player = Watching()
         player.rollouts = []
-        rows = evaluate(player, short_task, EvaluateConfig(3, 0, videos=0, **options))["episodes"]
+        rows = evaluate(player, short_task, EvaluateConfig(3, 0, **options))["episodes"]
         placements[name] = [row["placement"]["block"] for row in rows]
         # The table's colour in the corner of each rollout's first picture.
         tables[name] = {tuple(seen[0][0][-1, 0]) for seen in player.rollouts}
@@ -205,7 +206,7 @@ def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
 ):
     progress = []
     out = tmp_path / "evaluation.json"
-    config = EvaluateConfig(episodes=3, eval_seed=11, videos=0)
+    config = EvaluateConfig(episodes=3, eval_seed=11)
     result = evaluate(
         Player(), short_task, config, out=out, progress=lambda *counts: progress.append(counts)
     )
@@ -230,7 +231,7 @@ def test_successes_are_counted_and_carry_no_reason(evaluate, replay, peg_demonst
     task = get_task("peg_in_hole")
     task.placement_range = 0.002
     task.hold = 0.1
-    result = evaluate(replay, task, EvaluateConfig(episodes=2, videos=0))
+    result = evaluate(replay, task, EvaluateConfig(episodes=2))
     assert result["n_success"] == result["n_success_any"] == 2
     assert result["ci95"] == list(wilson_interval(2, 2))
     assert [row["reason"] for row in result["episodes"]] == [None, None]
@@ -239,22 +240,43 @@ def test_successes_are_counted_and_carry_no_reason(evaluate, replay, peg_demonst
 
 def test_the_same_seed_gives_the_same_rows_and_another_seed_other_placements(evaluate, short_task):
     def rows(seed):
-        config = EvaluateConfig(episodes=2, eval_seed=seed, videos=0)
+        config = EvaluateConfig(episodes=2, eval_seed=seed)
         return evaluate(Player(), short_task, config)["episodes"]
 
     assert rows(1) == rows(1)
     assert rows(1)[0]["placement"] != rows(2)[0]["placement"]
 
 
-def test_the_first_failures_are_filmed_beside_the_result(evaluate, short_task, tmp_path):
+def test_the_first_failures_are_handed_to_the_film_maker(evaluate, short_task, tmp_path):
+    filmed = []
     config = EvaluateConfig(episodes=3, videos=2)
-    result = evaluate(Player(), short_task, config, out=tmp_path / "e" / "evaluation.json")
-    assert [(row["episode"], row["outcome"]) for row in result["videos"]] == [
-        (0, "failure"),
-        (1, "failure"),
+    out = tmp_path / "e" / "evaluation.json"
+    result = evaluate(
+        Player(), short_task, config, out=out, film=lambda *asked: filmed.append(asked)
+    )
+    assert result["videos"] == [
+        {"path": f"videos/failure_{k:03d}.mp4", "episode": k, "outcome": "failure"} for k in (0, 1)
     ]
-    for row in result["videos"]:
-        assert (tmp_path / "e" / row["path"]).stat().st_size > 1000
+    assert read_json(out)["videos"] == result["videos"]
+    paths = [tmp_path / "e" / row["path"] for row in result["videos"]]
+    assert [(path, k, outcome) for path, _, k, outcome in filmed] == [
+        (paths[0], 0, "failure"),
+        (paths[1], 1, "failure"),
+    ]
+    for _, moments, _, _ in filmed:
+        assert [moment.seconds for moment in moments] == [step / 10 for step in range(7)]
+        assert not any(moment.success for moment in moments)
+        assert len({moment.overview.shape for moment in moments}) == 1
+        assert moments[0].overview.shape != moments[0].wrist.shape
+
+
+def test_without_a_camera_outside_there_are_no_videos_and_that_is_said(
+    evaluate, short_task, tmp_path, monkeypatch, caplog
+):
+    monkeypatch.setattr(module, "_OVERVIEW", "none")
+    config = EvaluateConfig(episodes=1, videos=1)
+    result = evaluate(Player(), short_task, config, out=tmp_path / "e.json", film=print)
+    assert result["videos"] == [] and "no camera named 'none'" in caplog.text
 
 
 def test_a_rollout_that_ends_before_its_first_step_does_not_stop_the_evaluation(
@@ -269,14 +291,21 @@ def test_a_rollout_that_ends_before_its_first_step_does_not_stop_the_evaluation(
     short_task.initial_state = initial_state
     away = peg_model.fk(stretched)[:3, :3].T @ [0.019, 0.0, -0.01]
     skill = Player([np.append([*away, 0, 0, 0], 0.67)] * 9)
-    config = EvaluateConfig(episodes=1, videos=1)
-    result = evaluate(skill, short_task, config, out=tmp_path / "e" / "evaluation.json")
+    filmed = []
+    result = evaluate(
+        skill,
+        short_task,
+        EvaluateConfig(episodes=1, videos=1),
+        out=tmp_path / "e" / "evaluation.json",
+        film=lambda path, moments, *_: filmed.append(len(moments)),
+    )
+    assert filmed == [1]
     assert result["episodes"][0]["steps"] == 0
     assert result["episodes"][0]["reason"].startswith("steered out of reach")
 
 
 def test_nothing_is_written_unless_asked(evaluate, short_task, tmp_path):
-    result = evaluate(Player(), short_task, EvaluateConfig(episodes=1, videos=2))
+    result = evaluate(Player(), short_task, EvaluateConfig(episodes=1))
     assert result["videos"] == [] and list(tmp_path.iterdir()) == []
 
 
@@ -294,7 +323,7 @@ def skill_directory(peg_dataset, tmp_path_factory):
 def test_two_processes_give_the_rows_of_one_and_leave_torch_s_threads_alone(
     skill_directory, short_task, make_peg_backend
 ):
-    config = EvaluateConfig(episodes=2, videos=0)
+    config = EvaluateConfig(episodes=2)
     before = torch.get_num_threads()
     try:
         results = [
@@ -317,6 +346,12 @@ def test_at_least_one_process_is_needed(evaluate, short_task, workers):
         evaluate(Player(), short_task, workers=workers)
 
 
+@pytest.mark.parametrize("options", [{"film": print}, {"out": Path("evaluation.json")}])
+def test_videos_need_a_film_maker_and_a_place(evaluate, short_task, options):
+    with pytest.raises(InvalidInput, match="videos: expected 0 without `film` and `out`, got 1"):
+        evaluate(Player(), short_task, EvaluateConfig(episodes=1, videos=1), **options)
+
+
 def test_a_missing_skill_is_refused(peg_task, make_peg_backend, tmp_path):
     with pytest.raises(MissingFile, match="no such skill directory"):
         evaluate_skill(tmp_path / "none", peg_task, make_peg_backend)
@@ -328,7 +363,7 @@ def test_a_result_that_cannot_be_written_is_an_error(evaluate, short_task, tmp_p
         evaluate(
             Player(),
             short_task,
-            EvaluateConfig(episodes=1, videos=0),
+            EvaluateConfig(episodes=1),
             out=tmp_path / "file" / "evaluation.json",
         )
 

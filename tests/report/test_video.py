@@ -13,7 +13,8 @@ import pytest
 
 from sart_toolkit.data.records import Image
 from sart_toolkit.errors import CannotWrite, InvalidInput, MissingExtra
-from sart_toolkit.report.video import caption, check_frame, font, inset, write_video
+from sart_toolkit.evaluate.rollout import Moment
+from sart_toolkit.report.video import caption, check_frame, film_rollout, font, inset, write_video
 
 
 def pictures(n: int, height: int = 64, width: int = 96) -> Iterator[Image]:
@@ -67,6 +68,22 @@ def test_video_decodes_to_what_was_written(tmp_path: Path) -> None:
     for t, picture in enumerate(pictures(12)):
         assert np.abs(decoded[t].astype(int) - picture).mean() < 4
     assert os.listdir(path.parent) == ["a.mp4"]
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_a_rollout_s_film_shows_outside_wrist_and_outcome_at_each_moment(
+    tmp_path: Path, n: int
+) -> None:
+    moments = [Moment(grey(96, 96, 90), grey(32, 32, 200), t / 10, t == 3) for t in range(n)]
+    path = tmp_path / "videos" / "success_007.mp4"
+    film_rollout(path, moments, 7, "success")
+    expected = [
+        caption(inset(m.overview, m.wrist), 7, m.seconds, "success", "goal reached" * m.success)
+        for m in moments
+    ]
+    decoded = decode(path, *expected[0].shape[:2])
+    assert len(decoded) == n and "10 fps" in probe(path)
+    assert np.abs(decoded.astype(int) - np.array(expected)).mean() < 5
 
 
 def test_video_is_what_browsers_play(tmp_path: Path) -> None:
