@@ -110,9 +110,15 @@ def make_dataset(task: str = "peg_in_hole", n_episodes: int = 12) -> Dataset:
         )  # fmt: skip
         sampled = p[KEYS[i]] + RADII[i] * direction / np.linalg.norm(direction)
         line = sampled + np.linspace(0, 1, 10)[:, None] * (p[t_star] - sampled)
+        certificate = {
+            "commanded": {"clearance": 0.00125 + 0.001 * k},
+            "measured": {"clearance": 0.0006249 + 0.001 * k},
+            "deviation": 0.000401 - 0.00001 * k,
+        }
         provenance = Provenance(
-            demonstration.content_hash(), i, k // 3, t_star, pose(sampled), 0, "sart", "paper"
-        )
+            demonstration.content_hash(), i, k // 3, t_star, pose(sampled), 0, "sart", "paper",
+            certificate,
+        )  # fmt: skip
         episodes.append(Episode(make_steps(line, 16), provenance))
     return Dataset(demonstration, annotation, tuple(episodes))
 
@@ -244,6 +250,12 @@ def _finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run_dir(_finished_run: Path, tmp_path: Path) -> Path:
     """A run directory of the test's own."""
     return Path(shutil.copytree(_finished_run, tmp_path / "run"))
+
+
+@pytest.fixture
+def write_dataset() -> Callable[[Path, Dataset], None]:
+    """Writes what `sart augment` leaves."""
+    return save_dataset
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import re
 import shutil
 from collections.abc import Callable
@@ -10,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from sart_toolkit.data.records import Demonstration
+from sart_toolkit.data.records import Dataset, Demonstration
 from sart_toolkit.errors import BrokenFile, CannotWrite, Mismatch, MissingFile
-from sart_toolkit.evaluate import report
+from sart_toolkit.report import page as report
 from sart_toolkit.report.figures import film_strip
-from sart_toolkit.report.page import Markup, duration, element, join, percent, write_report
+from sart_toolkit.report.page import at_least_mm, at_most_mm, duration, percent, write_report
 
 EditJson = Callable[[Path, dict[str, Any]], None]
 VOID = {"img", "source", "meta"}
@@ -128,7 +129,9 @@ def test_page_tells_the_figures(page: Page) -> None:
         "4 min 50 s",
         "12 of 15 attempted trajectories were kept (80 %)",
         "path too close peg / block",
-        "by at least 1",
+        "The commanded path of each was proved clear before the robot moved, by at least 1.25 mm.",
+        "The path through the joint positions measured on the way was proved clear as well, by at "
+        "least 0.62 mm; it left the commanded one by at most 0.41 mm.",
         "80.0 mm",
         "gripper - table",
         "compact_mlp was trained for 12 epochs",
@@ -140,6 +143,27 @@ def test_page_tells_the_figures(page: Page) -> None:
         "2.13.0",
     ):
         assert words in page.text
+
+
+def test_claims_of_clearance_are_the_episodes_own(
+    run_dir: Path, dataset: Dataset, write_dataset: Callable[[Path, Dataset], None]
+) -> None:
+    proof = {"commanded": {"clearance": 0.004}, "measured": {"clearance": 0.003}, "deviation": 2e-4}
+    episodes = [
+        dataclasses.replace(
+            episode,
+            provenance=dataclasses.replace(
+                episode.provenance, certificate=proof if k < 5 else None
+            ),
+        )
+        for k, episode in enumerate(dataset.episodes)
+    ]
+    shutil.rmtree(run_dir / "dataset")
+    write_dataset(run_dir / "dataset", dataclasses.replace(dataset, episodes=tuple(episodes)))
+    text = written(run_dir).text
+    assert "The commanded path of 5 of them was proved clear" in text
+    assert "by at least 4.00 mm" in text and "by at least 3.00 mm" in text
+    assert "by at most 0.20 mm" in text
 
 
 def test_every_rollout_is_in_the_table(page: Page) -> None:
@@ -295,17 +319,6 @@ def test_page_that_can_not_be_written_is_an_error(run_dir: Path) -> None:
         write_report(run_dir, run_dir / "run.json" / "report.html")
 
 
-def test_elements_escape_all_but_markup() -> None:
-    assert element("p", "a < b", Markup("<b>c</b>"), title='"&') == (
-        '<p title="&quot;&amp;">a &lt; b<b>c</b></p>'
-    )
-    assert element("video", muted=True, loop=False, aria_label="x", class_="y") == (
-        '<video muted aria-label="x" class="y"></video>'
-    )
-    assert element("img", alt="") == '<img alt="">'
-    assert join(["<", Markup("<")]) == "&lt;<"
-
-
 @pytest.mark.parametrize(
     ("seconds", "words"),
     [
@@ -320,3 +333,19 @@ def test_durations_read_naturally(seconds: float, words: str) -> None:
 def test_shares_read_naturally() -> None:
     shares = [percent(share).replace("\N{NO-BREAK SPACE}", " ") for share in (0, 0.8, 0.9287, 1)]
     assert shares == ["0 %", "80 %", "92.9 %", "100 %"]
+
+
+@pytest.mark.parametrize(
+    ("metres", "at_least", "at_most"),
+    [
+        (0.0002, "0.20", "0.20"),
+        (0.00125, "1.25", "1.25"),
+        (0.0012549, "1.25", "1.26"),
+        (0, "0.00", "0.00"),
+    ],
+)
+def test_bounds_are_rounded_to_where_they_still_hold(
+    metres: float, at_least: str, at_most: str
+) -> None:
+    assert at_least_mm(metres) == f"{at_least}\N{NO-BREAK SPACE}mm"
+    assert at_most_mm(metres) == f"{at_most}\N{NO-BREAK SPACE}mm"
