@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from sart_toolkit.collision.certificate import certify
     from sart_toolkit.collision.demonstrated import DemonstratedScene
     from sart_toolkit.collision.model import CollisionModel
+    from sart_toolkit.data.assets import asset
     from sart_toolkit.data.sampling import SamplingConfig
     from sart_toolkit.data.storage import (
         load_annotation,
@@ -51,6 +52,7 @@ _HOMES = {
     "ScriptedOperator": "record.scripted",
     "SuggestConfig": "annotate.suggest",
     "TrainConfig": "learn.training",
+    "asset": "data.assets",
     "augment_demonstration": "augment.engine",
     "certify": "collision.certificate",
     "evaluate_skill": "evaluate.rollout",
@@ -85,6 +87,7 @@ __all__ = [
     "ScriptedOperator",
     "SuggestConfig",
     "TrainConfig",
+    "asset",
     "augment_demonstration",
     "certify",
     "evaluate_skill",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,7 +13,7 @@ from sart_toolkit.errors import BrokenFile
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.spec import SceneSpec
 
-_VERSION = 3
+_VERSION = 4
 
 
 def scene_digest(model: RobotModel, scene: SceneSpec) -> str:
@@ -44,7 +43,8 @@ def pack_state(kind: str, head: Mapping[str, Any], payload: bytes) -> bytes:
         head: JSON values; `robot`, `scene` (a `scene_digest`) and `bodies` among them.
         payload: the simulator's own bytes.
     """
-    body = zlib.compress(json.dumps(head).encode() + b"\n" + payload, 1)
+    # Not compressed: a demonstration's states are nearly alike, so its file packs them together.
+    body = json.dumps(head).encode() + b"\n" + payload
     return _magic(kind) + hashlib.sha256(body).digest() + body
 
 
@@ -67,12 +67,12 @@ def unpack_state(
     try:
         if not state.startswith(magic):
             raise ValueError(f"not a state of backend {kind!r}")
-        sha, packed = state[len(magic) :][:32], state[len(magic) + 32 :]
-        if hashlib.sha256(packed).digest() != sha:
+        sha, body = state[len(magic) :][:32], state[len(magic) + 32 :]
+        if hashlib.sha256(body).digest() != sha:
             raise ValueError("damaged")
-        head_line, payload = zlib.decompress(packed).split(b"\n", 1)
+        head_line, payload = body.split(b"\n", 1)
         head: dict[str, Any] = json.loads(head_line)
-    except (ValueError, zlib.error) as error:
+    except ValueError as error:
         raise BrokenFile(f"saved state: {error}; record the demonstration again") from error
     if head["scene"] != scene:
         raise BrokenFile(

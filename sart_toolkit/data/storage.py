@@ -11,6 +11,7 @@ import dataclasses
 import fcntl
 import io
 import json
+import lzma
 import os
 import shutil
 import tempfile
@@ -41,7 +42,7 @@ from sart_toolkit.errors import (
     SartError,
 )
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 
 # --- writing safely -----------------------------------------------------------------------------
@@ -319,7 +320,9 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
     except SartError:
         raise
     # A damaged file may hold anything in place of a group, a number or JSON.
-    except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+    except (
+        OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, lzma.LZMAError
+    ) as error:  # fmt: skip
         raise BrokenFile(
             f"{path}: truncated or not a {kind} file ({error}); restore a copy or make it again"
         ) from error
@@ -384,7 +387,9 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
             file[f"body_Ts_world/{name}"] = Ts
         sizes = np.array([len(state) for state in d.states], dtype=np.int64)
         file["states/sizes"] = sizes
-        file.create_dataset("states/bytes", data=np.frombuffer(b"".join(d.states), dtype=np.uint8))
+        # States are nearly alike, and farther apart than the windows of HDF5's filters reach.
+        packed = lzma.compress(b"".join(d.states), preset=0)
+        file["states/xz"] = np.frombuffer(packed, dtype=np.uint8)
         file.attrs["meta"] = json.dumps(
             {
                 "task": d.task,
@@ -411,7 +416,7 @@ def load_demonstration(path: Path) -> Demonstration:
     with _reading(path, "demonstration") as file:
         meta = json.loads(file.attrs["meta"])
         expected = meta.pop("content_hash")
-        packed = file["states/bytes"][()].tobytes()
+        packed = lzma.decompress(file["states/xz"][()].tobytes())
         ends = np.cumsum(file["states/sizes"][()])
         starts = ends - file["states/sizes"][()]
         demonstration = Demonstration(

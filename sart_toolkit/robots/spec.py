@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from sart_toolkit.data.assets import asset
 from sart_toolkit.errors import InvalidInput, MissingExtra, MissingFile
 from sart_toolkit.poses import Array, check_array, check_pose, check_positive, frozen
 
@@ -237,14 +238,16 @@ class RobotSpec:
 
 
 def resource_path(resource: str) -> Path:
-    """The file that `package:path/inside/it` or a plain path names.
+    """The file that `package:path/inside/it` or a plain path names; `sart_toolkit:` is `assets/`.
 
     Raises:
         MissingExtra: the package isn't installed.
         MissingFile: the file isn't there.
     """
     package, colon, inside = resource.partition(":")
-    if colon:
+    if colon and package == "sart_toolkit":
+        path = asset(inside)
+    elif colon:
         try:
             found = importlib.util.find_spec(package)
         except (ModuleNotFoundError, ValueError):

@@ -13,7 +13,7 @@ _STEEL = (0.60, 0.62, 0.65, 1.0)
 SPEC = ur5e_with(
     "ur5e_hande",
     GripperSpec(
-        urdf="sart_toolkit:robots/urdfs/hande.urdf",
+        urdf="sart_toolkit:robots/hande.urdf",
         parent_frame="tool0",
         driver="gripper_left_jaw_joint",
         followers={"gripper_right_jaw_joint": 1.0},

@@ -61,7 +61,7 @@ from sart_toolkit.errors import (
 )
 from sart_toolkit.poses import pose
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=25)
 
 
@@ -208,6 +208,15 @@ def test_a_demonstration_of_any_make_is_read_back(n, seed, cameras, bodies, stat
         loaded = load_demonstration(Path(directory) / "demo.h5")
     assert same(loaded, demonstration)
     assert loaded.content_hash() == demonstration.content_hash()
+
+
+def test_states_that_are_nearly_alike_take_hardly_more_room_than_one(tmp_path):
+    world = np.random.default_rng(0).bytes(100_000)
+    alike = tuple(b"step %d " % i + world for i in range(20))
+    demonstration = dataclasses.replace(make_demonstration(20), states=alike)
+    save_demonstration(tmp_path / "demo.h5", demonstration)
+    assert (tmp_path / "demo.h5").stat().st_size < 200_000
+    assert load_demonstration(tmp_path / "demo.h5").states == alike
 
 
 @pytest.mark.parametrize("name", ["lid/hinge", "."])
@@ -404,6 +413,10 @@ def _misname_sizes(file):
     file["states/sizes"] = "many"
 
 
+def _scramble_states(file):
+    file["states/xz"][40:60] = 0
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -413,6 +426,7 @@ def _misname_sizes(file):
         _spoil,
         _shorten,
         _misname_sizes,
+        _scramble_states,
         functools.partial(_change_meta, colour="red"),
         functools.partial(_change_meta, task=None),
         lambda file: file.attrs.__setitem__("meta", 5),
@@ -421,8 +435,9 @@ def _misname_sizes(file):
         lambda file: file.attrs.__setitem__("kind", [1, 2]),
     ],
     ids=[
-        "no steps", "steps no group", "not rigid", "NaN", "short", "sizes", "unknown meta",
-        "other task", "meta a number", "meta a list", "meta no JSON", "kind a list",
+        "no steps", "steps no group", "not rigid", "NaN", "short", "sizes", "states",
+        "unknown meta", "other task", "meta a number", "meta a list", "meta no JSON",
+        "kind a list",
     ],
 )  # fmt: skip
 def test_a_demonstration_file_whose_content_is_wrong_is_broken(damage, tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from sart_toolkit.data.assets import asset
 from sart_toolkit.errors import InvalidInput, MissingExtra, MissingFile
 from sart_toolkit.poses import check_pose, inverse, pose
 from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, look_at, resource_path
@@ -161,6 +162,7 @@ def test_a_resource_is_found_in_a_package_or_by_its_path(spec, tmp_path):
     found = resource_path(spec.urdf)
     assert found.name == "ur5e.urdf"
     assert resource_path(str(found)) == found
+    assert resource_path("sart_toolkit:robots/hande.urdf") == asset("robots/hande.urdf")
 
 
 @pytest.mark.parametrize("package", ["no_such_package", "no_such_package.inside"])

@@ -1,0 +1,23 @@
+"""What comes with the toolkit and is no code: URDFs, and a small recorded demonstration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sart_toolkit.errors import MissingFile
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+def asset(name: str) -> Path:
+    """The file in the toolkit's `assets/`, such as `peg_in_hole/demo.h5`.
+
+    Raises:
+        MissingFile: there is no such asset.
+    """
+    # An installed wheel has them inside the package, a checkout beside it.
+    inside = _PACKAGE / "assets"
+    path = (inside if inside.is_dir() else _PACKAGE.parent / "assets") / name
+    if not path.is_file():
+        raise MissingFile(f"{name}: no such asset of sart_toolkit; check the name")
+    return path

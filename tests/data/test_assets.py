@@ -1,0 +1,50 @@
+"""What comes with the toolkit is found, and the recorded demonstration is ready for use."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import pytest
+
+import sart_toolkit as sart
+from sart_toolkit.data import assets
+from sart_toolkit.errors import MissingFile
+
+
+def test_an_asset_is_found_beside_the_package_or_inside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "sart_toolkit"
+    monkeypatch.setattr(assets, "_PACKAGE", package)
+    for root in (tmp_path / "assets", package / "assets"):
+        (root / "robots").mkdir(parents=True)
+        (root / "robots" / "arm.urdf").write_text("")
+        assert assets.asset("robots/arm.urdf") == root / "robots" / "arm.urdf"
+
+
+@pytest.mark.parametrize("name", ["robots/none.urdf", "robots", "../pyproject.toml/x"])
+def test_a_missing_asset_is_told(name: str) -> None:
+    with pytest.raises(MissingFile, match="no such asset of sart_toolkit"):
+        sart.asset(name)
+
+
+def test_the_demonstration_is_small_and_augmented_without_recording(tmp_path: Path) -> None:
+    path = sart.asset("peg_in_hole/demo.h5")
+    assert path.stat().st_size < 1.5e6
+    demonstration = sart.load_demonstration(path)
+    annotation = sart.load_annotation(sart.asset("peg_in_hole/annotation.json"))
+    annotation.check_matches(demonstration)
+    task = sart.get_task(demonstration.task)
+    assert task.achieved(demonstration.success)
+    make_backend = functools.partial(
+        sart.make_backend,
+        demonstration.backend,
+        sart.get_robot(demonstration.robot),
+        task.scene,
+        demonstration.steps.cameras["wrist"].rgb.shape[1],
+    )
+    dataset = sart.augment_demonstration(
+        demonstration, annotation, make_backend, tmp_path / "dataset", sart.AugmentConfig(n=3)
+    )
+    assert dataset.info["n_kept"] == 2
