@@ -1,7 +1,8 @@
 # `make` alone lists what there is.
 
 PYTHON ?= $(or $(shell command -v python3.11),python3)
-PYTEST_ARGS ?= -n 2 --dist loadfile
+# In the order of tests/conftest.py, not by each file's number of tests.
+PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
 DEMO_OUT ?= runs/demo
 
 VENV := .venv
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-all demo test lint clean
+.PHONY: help setup setup-all demo test lint dist-check clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -32,6 +33,9 @@ lint: setup ## check style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+dist-check: setup ## build wheel and sdist, and run each in an empty environment
+	$(BIN)/python tools/check_wheel.py
 
 clean: ## remove .venv, caches and build products, but not runs/
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

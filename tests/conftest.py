@@ -26,6 +26,20 @@ from sart_toolkit.tasks.task import Placement, Task
 
 PICTURE_SIZE = 48
 
+# The files that take longest are begun first: at the end, one process would wait for another.
+LONGEST = (
+    "test_cli.py",
+    "test_contract.py",
+    "test_faults.py",
+    "test_human_path.py",
+    "test_task.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first, then the order in which tests were found."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _interruptible() -> Iterator[None]:

@@ -16,7 +16,7 @@ from sart_toolkit.cli import main
 from sart_toolkit.data.storage import load_demonstration
 from sart_toolkit.doctor import Finding
 from sart_toolkit.report.page import write_report
-from sart_toolkit.tasks import TASKS
+from sart_toolkit.tasks import TASKS, get_task
 
 
 def run(capsys: pytest.CaptureFixture[str], *argv: object) -> dict[str, Any]:
@@ -52,6 +52,14 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.fixture
+def _short_rollouts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What has learned next to nothing need not err for long."""
+    for name in TASKS:
+        monkeypatch.setattr(type(get_task(name)), "horizon", 1.5)
+
+
+@pytest.mark.usefixtures("_short_rollouts")
 def test_whole_run_leaves_every_result_and_goes_on_where_it_was(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -374,6 +382,7 @@ def test_the_replay_benchmark_compares_backends(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_short_rollouts")
 def test_every_task_runs_from_demonstration_to_report_on_every_backend(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
