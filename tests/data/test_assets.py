@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 
 import pytest
@@ -29,22 +28,11 @@ def test_a_missing_asset_is_told(name: str) -> None:
         sart.asset(name)
 
 
-def test_the_demonstration_is_small_and_augmented_without_recording(tmp_path: Path) -> None:
+def test_the_demonstration_is_small_reached_the_goal_and_is_annotated() -> None:
     path = sart.asset("peg_in_hole/demo.h5")
     assert path.stat().st_size < 1.5e6
     demonstration = sart.load_demonstration(path)
+    assert sart.get_task(demonstration.task).achieved(demonstration.success)
     annotation = sart.load_annotation(sart.asset("peg_in_hole/annotation.json"))
     annotation.check_matches(demonstration)
-    task = sart.get_task(demonstration.task)
-    assert task.achieved(demonstration.success)
-    make_backend = functools.partial(
-        sart.make_backend,
-        demonstration.backend,
-        sart.get_robot(demonstration.robot),
-        task.scene,
-        demonstration.steps.cameras["wrist"].rgb.shape[1],
-    )
-    dataset = sart.augment_demonstration(
-        demonstration, annotation, make_backend, tmp_path / "dataset", sart.AugmentConfig(n=3)
-    )
-    assert dataset.info["n_kept"] == 2
+    assert annotation.spheres
