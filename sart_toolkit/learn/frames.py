@@ -57,6 +57,9 @@ def resize_area(rgb: Image, size: tuple[int, int]) -> Image:
 def _area_sums(x: NDArray[Any], size: int) -> NDArray[np.int64]:
     """Sums `(size, m)` of `x (n, m)` over `size` equal parts of its rows; a row counts `size`."""
     n = len(x)
+    if n % size == 0:
+        # Usual, and five times as quick.
+        return size * x.reshape(size, n // size, -1).sum(1, dtype=np.int64)
     before = np.zeros((n + 1, x.shape[1]), np.int64)
     np.cumsum(x, axis=0, out=before[1:])
     whole, part = np.divmod(np.arange(size + 1) * n, size)
@@ -142,7 +145,9 @@ class Frames:
                 cut from the padded ones: the same for all of them. In the middle when left out.
         """
         images = {camera: self._gather(camera, at, offsets) for camera in self.images}
-        self._let_go(at.numel())
+        self._gathered += at.numel() * (self.layout.frame_bytes + 2 * _FAULT_AROUND)
+        if self._gathered > _MAPPED_AT_MOST:
+            self.let_go()
         return images
 
     def _gather(self, camera: str, at: Tensor, offsets: Tensor | None) -> Tensor:
@@ -166,9 +171,8 @@ class Frames:
             start = step * size // mmap.PAGESIZE * mmap.PAGESIZE
             self._mapped.madvise(mmap.MADV_WILLNEED, start, (step + 1) * size - start)
 
-    def _let_go(self, n_steps: int) -> None:
-        """Unmap what was gathered before it is much; the kernel keeps what it has room for."""
-        self._gathered += n_steps * (self.layout.frame_bytes + 2 * _FAULT_AROUND)
-        if self._mapped is not None and self._gathered > _MAPPED_AT_MOST:
+    def let_go(self) -> None:
+        """Unmap what was gathered; the kernel keeps what it has room for."""
+        if self._mapped is not None:
             self._mapped.madvise(mmap.MADV_DONTNEED)
-            self._gathered = 0
+        self._gathered = 0
