@@ -283,6 +283,19 @@ def test_cuda_is_refused_where_there_is_none(monkeypatch):
         resolve_device("cuda")
 
 
+@pytest.mark.parametrize(
+    ("device", "free", "expected"),
+    [("cuda", 2.1, True), ("cuda", 1.9, False), ("cpu", 100, False)],
+)
+def test_a_gpu_holds_the_images_if_half_of_it_does(
+    dataset, open_windows, monkeypatch, device, free, expected
+):
+    windows = open_windows(dataset)
+    n_bytes = windows.frames.images["wrist"].nbytes
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free * n_bytes, 1e12))
+    assert training._has_room(torch.device(device), windows) is expected
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("policy", sorted(POLICIES))
