@@ -10,12 +10,15 @@ import argparse
 import dataclasses
 import functools
 import importlib.metadata
+import itertools
 import json
+import math
+import os
 import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -47,8 +50,9 @@ from sart_toolkit.data.records import (
 )
 from sart_toolkit.data.storage import load_demonstration, save_demonstration
 from sart_toolkit.errors import InvalidInput, MotionRejected, SartError, Unreachable, unknown_name
+from sart_toolkit.learn.frames import input_size
 from sart_toolkit.learn.policies import POLICIES
-from sart_toolkit.learn.samples import Batch, build_windows
+from sart_toolkit.learn.samples import FRAMES, Batch, WindowConfig, Windows, open_windows
 from sart_toolkit.learn.training import (
     TrainConfig,
     build_policy,
@@ -75,6 +79,7 @@ from sart_toolkit.testing.desktop import Desktop
 if TYPE_CHECKING:
     from sart_toolkit.annotate.open3d_window import WindowConfig
 
+_RECORDED_SIZE = 128
 _DEMONSTRATION_STEPS = 60
 _SEGMENT_STEPS = 20
 
@@ -116,9 +121,11 @@ def bench_train(arguments: Sequence[str]) -> dict[str, Any]:
 
 def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[str, Any]:
     device = resolve_device(config.device)
-    windows = build_windows(_synthetic_dataset(2), config.camera, config.image_size, config.history)
+    window_config = WindowConfig(config.cameras, config.image_size, config.history)
+    with tempfile.TemporaryDirectory() as scratch:
+        windows = open_windows(_synthetic_dataset(2), window_config, Path(scratch))
     first = torch.arange(config.batch_size) % len(windows.history)
-    bare_step = _bare_stepper(config, windows.to(device).batch(first))
+    bare_step = _stepper(config, itertools.repeat(windows.to(device).batch(first)))
     # The first steps choose and compile kernels.
     step_seconds = [bare_step() for _ in range(6)]
     per_block = max(2, round(seconds / (2 * statistics.median(step_seconds[2:]) * n_blocks)))
@@ -170,17 +177,19 @@ def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[s
     }
 
 
-def _bare_stepper(config: TrainConfig, batch: Batch) -> Callable[[], float]:
-    """A function that takes one forward-backward-step on a batch and returns its seconds."""
+def _stepper(config: TrainConfig, batches: Iterator[Batch]) -> Callable[[], float]:
+    """A function that draws a batch, takes one step on it and returns the seconds of both."""
     device = resolve_device(config.device)
     bfloat16 = resolve_bfloat16(config.bfloat16, device)
-    policy = build_policy(config).to(device).train()
+    size = input_size((_RECORDED_SIZE, _RECORDED_SIZE), config.image_size)
+    policy = build_policy(config, dict.fromkeys(config.cameras, size)).to(device).train()
     optimizer = make_optimizer(policy, config)
 
     def step() -> float:
         began = time.perf_counter()
+        batch = next(batches)
         with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16):
-            loss = policy.loss(*batch)
+            loss = policy.loss(batch)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
@@ -195,40 +204,62 @@ def _synchronise(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def _synthetic_dataset(n_episodes: int) -> Dataset:
-    """A dataset of random 128x128 pictures, shaped as augmentation makes them."""
-    rng = np.random.default_rng(0)
+def _synthetic_steps(n: int, rng: np.random.Generator) -> Steps:
+    """Steps with random square pictures."""
+    commanded = np.tile(pose((0.4, 0.0, 0.3)), (n, 1, 1))
+    commanded[:, :3, 3] += np.cumsum(rng.normal(0, 0.005, (n, 3)), 0)
+    size = (n, _RECORDED_SIZE, _RECORDED_SIZE)
+    camera = CameraRecord(
+        rgb=np.frombuffer(rng.bytes(3 * math.prod(size)), np.uint8).reshape(*size, 3),
+        depth=np.zeros(size, np.float32),
+        intrinsics=np.diag([_RECORDED_SIZE, _RECORDED_SIZE, 1.0]),
+        T_tool_camera=np.eye(4),
+    )
+    joints = np.zeros((n, 6))
+    gripper = rng.uniform(0, 1, n)
+    return Steps(
+        joint_positions=joints,
+        joint_velocities=joints,
+        commanded_joint_positions=joints,
+        measured_Ts_world_tool=commanded,
+        commanded_Ts_world_tool=commanded,
+        measured_gripper=gripper,
+        commanded_gripper=gripper,
+        contact_force=np.zeros(n),
+        cameras={"wrist": camera},
+    )
 
-    def steps(n: int) -> Steps:
-        commanded = np.tile(pose((0.4, 0.0, 0.3)), (n, 1, 1))
-        commanded[:, :3, 3] += np.cumsum(rng.normal(0, 0.005, (n, 3)), 0)
-        camera = CameraRecord(
-            rgb=rng.integers(0, 256, (n, 128, 128, 3), dtype=np.uint8),
-            depth=np.zeros((n, 128, 128), np.float32),
-            intrinsics=np.diag([128.0, 128.0, 1.0]),
-            T_tool_camera=np.eye(4),
-        )
-        joints = np.zeros((n, 6))
-        gripper = rng.uniform(0, 1, n)
-        return Steps(
-            joint_positions=joints,
-            joint_velocities=joints,
-            commanded_joint_positions=joints,
-            measured_Ts_world_tool=commanded,
-            commanded_Ts_world_tool=commanded,
-            measured_gripper=gripper,
-            commanded_gripper=gripper,
-            contact_force=np.zeros(n),
-            cameras={"wrist": camera},
-        )
 
+class _SyntheticEpisodes:
+    """Episodes made when asked for, and not kept."""
+
+    def __init__(self, n: int, demonstration: Demonstration) -> None:
+        self._n = n
+        self._demonstration_hash = demonstration.content_hash()
+        self._key = demonstration.steps.measured_Ts_world_tool[0]
+
+    def __len__(self) -> int:
+        return self._n
+
+    def __iter__(self) -> Iterator[Episode]:
+        for k in range(self._n):
+            steps = _synthetic_steps(_SEGMENT_STEPS, np.random.default_rng([0, k]))
+            t_star = _DEMONSTRATION_STEPS // 2
+            yield Episode(
+                steps,
+                Provenance(self._demonstration_hash, 0, k, t_star, self._key, 0, "sart", "paper"),
+            )
+
+
+def _synthetic_dataset(n_episodes: int, lazy: bool = False) -> Dataset:
+    """A dataset of random pictures, shaped as augmentation makes them."""
     n = _DEMONSTRATION_STEPS
     demonstration = Demonstration(
         task="synthetic",
         task_parameters={},
         robot="none",
         backend="none",
-        steps=steps(n),
+        steps=_synthetic_steps(n, np.random.default_rng(0)),
         timestamps=np.arange(n) / 10,
         body_Ts_world={},
         success=np.ones(n, bool),
@@ -239,16 +270,136 @@ def _synthetic_dataset(n_episodes: int) -> Dataset:
         device="none",
         seconds=0.0,
     )
-    sha = demonstration.content_hash()
     key = demonstration.steps.measured_Ts_world_tool[0]
-    episodes = tuple(
-        Episode(
-            steps(_SEGMENT_STEPS),
-            Provenance(sha, 0, k, n // 2, key, 0, "sart", "paper"),
-        )
-        for k in range(n_episodes)
+    annotation = Annotation((PrecisionSphere(0, key, 0.1),), demonstration.content_hash())
+    episodes: Any = _SyntheticEpisodes(n_episodes, demonstration)
+    return Dataset(demonstration, annotation, episodes if lazy else tuple(episodes))
+
+
+# --- training data ------------------------------------------------------------------------------
+
+
+def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
+    """Training from the file of images: its memory, and images/s over a copy in memory.
+
+    As many episodes as asked for are made up one by one and written by `open_windows`, then steps
+    are taken on random batches from the file; the peak of this process's memory so far, its
+    imports included, is what is reported: all of it, and the part that no file backs. Only then the
+    images are copied into memory, and blocks of steps on batches from the file and from the copy
+    alternate, so that whatever else the machine does slows both; the ratio is the median over
+    blocks. Last, blocks of steps after the kernel was told to drop what it keeps of the file.
+    """
+    parser = argparse.ArgumentParser(
+        prog="bench.py training-data", description=bench_training_data.__doc__
     )
-    return Dataset(demonstration, Annotation((PrecisionSphere(0, key, 0.1),), sha), episodes)
+    parser.add_argument("--episodes", type=int, default=10_000, help=f"of {_SEGMENT_STEPS} steps")
+    parser.add_argument("--policy", default="compact_mlp", help=", ".join(POLICIES))
+    parser.add_argument("--image-size", type=int, default=64, help="[pixels]")
+    parser.add_argument("--blocks", type=int, default=10, help="blocks of steps, for the median")
+    parser.add_argument("--steps", type=int, default=20, help="of a block")
+    parser.add_argument("--threads", type=int, help="torch's threads; its own choice if left out")
+    parser.add_argument("--folder", type=Path, help="where the file goes; a temporary one")
+    options = parser.parse_args(arguments)
+    for name in ("episodes", "blocks", "steps"):
+        check_positive(f"--{name}", getattr(options, name))
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    config = TrainConfig.for_policy(options.policy, image_size=options.image_size, device="cpu")
+    window_config = WindowConfig(
+        config.cameras, config.image_size, config.history, config.image_shift
+    )
+    peak_anonymous = 0
+    with tempfile.TemporaryDirectory(dir=options.folder) as scratch:
+
+        def reading(done: int, total: int) -> None:
+            nonlocal peak_anonymous
+            if done % 200 == 0 or done == total:
+                peak_anonymous = max(peak_anonymous, _memory("RssAnon"))
+                _say(f"read {done}/{total}")
+
+        at_start = _memory("VmRSS")
+        dataset = _synthetic_dataset(options.episodes, lazy=True)
+        started = time.perf_counter()
+        windows = open_windows(dataset, window_config, Path(scratch), reading)
+        writing_seconds = time.perf_counter() - started
+        file = Path(scratch) / FRAMES
+        mapped_step = _stepper(config, _random_batches(config, windows))
+        for _ in range(options.blocks * options.steps):
+            mapped_step()
+            peak_anonymous = max(peak_anonymous, _memory("RssAnon"))
+        peak = _memory("VmHWM")
+
+        copy = windows.to(torch.device("cpu"))
+        copied_step = _stepper(config, _random_batches(config, copy))
+        n_images = config.batch_size * config.history * options.steps
+
+        def block(step: Callable[[], float]) -> float:
+            return n_images / sum(step() for _ in range(options.steps))
+
+        block(copied_step)
+        mapped, copied, cold = [], [], []
+        for turn in range(options.blocks):
+            mapped.append(block(mapped_step))
+            copied.append(block(copied_step))
+            _say(f"block {turn + 1}/{options.blocks}: {mapped[-1] / copied[-1]:.3f} of a copy")
+        for _ in range(options.blocks):
+            _drop_from_cache(file, windows)
+            cold.append(block(mapped_step))
+        ratios = [a / b for a, b in zip(mapped, copied, strict=True)]
+        return {
+            "episodes": options.episodes,
+            "images": len(windows.gripper),
+            "windows": int(windows.multiplicity.sum()),
+            "file_gb": file.stat().st_size / 1e9,
+            "writing_seconds": writing_seconds,
+            "peak_memory_gb": {
+                "at_start": at_start / 1e9,
+                "anonymous": peak_anonymous / 1e9,
+                "total": peak / 1e9,
+            },
+            "images_per_second": {
+                "file": statistics.median(mapped),
+                "copy": statistics.median(copied),
+                "file_from_disk": statistics.median(cold),
+            },
+            "file_over_copy": statistics.median(ratios),
+            "file_over_copy_range": [min(ratios), max(ratios)],
+            "file_from_disk_over_copy": statistics.median(cold) / statistics.median(copied),
+            "policy": config.policy,
+            "image_size": config.image_size,
+            "image_shift": config.image_shift,
+            "batch_size": config.batch_size,
+            "blocks": options.blocks,
+            "steps_per_block": options.steps,
+            "threads": torch.get_num_threads(),
+        }
+
+
+def _random_batches(config: TrainConfig, windows: Windows) -> Iterator[Batch]:
+    """Batches as the training loop draws them, epoch after epoch."""
+    size = config.batch_size
+    for epoch in itertools.count():
+        rng = np.random.default_rng([config.seed, epoch])
+        order = torch.from_numpy(windows.epoch_order(rng))
+        offsets = torch.from_numpy(rng.integers(0, 2 * config.image_shift + 1, (len(order), 2)))
+        for start in range(0, len(order) - size + 1, size):
+            windows.will_need(order[start + size : start + 2 * size])
+            yield windows.batch(order[start : start + size], offsets[start : start + size])
+
+
+def _memory(name: str) -> int:
+    """A figure of this process's memory [bytes], by its name in Linux's table."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1]) * 1024
+    raise InvalidInput(f"{name}: not in /proc/self/status")
+
+
+def _drop_from_cache(file: Path, windows: Windows) -> None:
+    """Have the kernel forget what it keeps of a file in memory."""
+    windows.frames.let_go()
+    with open(file, "rb") as opened:
+        os.posix_fadvise(opened.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 # --- augmentation -------------------------------------------------------------------------------
@@ -705,6 +856,7 @@ BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "certificate": bench_certificate,
     "step": bench_step,
     "train": bench_train,
+    "training-data": bench_training_data,
 }
 
 

@@ -278,6 +278,8 @@ class Train:
 
     Example: sart train dataset --out skill --policy resnet18_mlp --epochs 20 --lr 3e-4
         --schedule cosine --image-size 64
+
+    Example: sart train dataset --out skill --cameras wrist,overview
     """
 
     dataset: Annotated[
@@ -296,6 +298,7 @@ class Train:
     image_shift: Annotated[
         int | None, arg(help="Random shift of the pictures, up to this [pixels].")
     ] = None
+    cameras: Annotated[str, arg(help="Cameras it sees, names with commas between.")] = "wrist"
     schedule: Annotated[
         Literal["cosine", "constant"] | None, arg(help="Course of the learning rate.")
     ] = None

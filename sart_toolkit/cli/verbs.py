@@ -267,6 +267,7 @@ def train_verb(args: Train) -> Result:
         schedule=args.schedule,
         norm=args.norm,
         backbone_weights=args.backbone_weights and str(args.backbone_weights),
+        cameras=tuple(args.cameras.split(",")),
         seed=args.seed,
         device=args.device,
     )
@@ -274,14 +275,21 @@ def train_verb(args: Train) -> Result:
     check_writable(args.out / "config.json", args.overwrite)
     if args.overwrite and (args.out / "config.json").exists():
         clear_directory(args.out, "config.json", overwrite=True)
-    with progress_bar("train", None, "step") as bar:
+    with (
+        progress_bar("read", None, "trajectory") as read,
+        progress_bar("train", None, "step") as bar,
+    ):
+
+        def reading(done: int, total: int) -> None:
+            read.total = total
+            read.update(done - read.n)
 
         def progress(done: int, total: int, text: str) -> None:
             bar.total = total
             bar.set_postfix_str(text, refresh=False)
             bar.update(done - bar.n)
 
-        result = train(dataset, config, args.out, progress)
+        result = train(dataset, config, args.out, progress, reading=reading)
     save_skill(args.out, result, dataset)
     return {"skill": str(args.out), **_describe_skill(args.out)}
 
@@ -297,7 +305,7 @@ def evaluate_verb(args: Evaluate) -> Result:
         args.backend or skill.config.backend,
         task,
         skill.config.robot,
-        skill.config.recorded_size[0],
+        skill.config.cameras[skill.cameras[0]].size[0],
     )
     check_writable(args.out, args.overwrite)
     with progress_bar("evaluate", args.episodes, "rollout") as bar:

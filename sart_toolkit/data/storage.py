@@ -243,6 +243,23 @@ def check_writable(path: Path, overwrite: bool = False) -> None:
             pass
 
 
+def check_room(path: Path, n_bytes: int) -> None:
+    """Return if the disk has room for a file of so many bytes at `path`.
+
+    Raises:
+        CannotWrite: it hasn't.
+    """
+    parent = Path(path).absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    free = shutil.disk_usage(parent).free
+    if n_bytes > free:
+        raise CannotWrite(
+            f"{path}: needs {n_bytes / 1e9:.1f} GB and {free / 1e9:.1f} GB are free; make room or "
+            "choose another --out"
+        )
+
+
 def remove(path: Path) -> None:
     """Remove a file or directory tree if it is there.
 

@@ -123,8 +123,8 @@ def run_rollout(
         model: the robot's kinematics.
         placement: where the object stands.
         seed: (evaluation seed, episode), for the record.
-        watch: called at the start and after each 10 Hz step with the wrist picture, the number of
-            steps done and whether the goal is reached.
+        watch: called at the start and after each 10 Hz step with the image of the skill's first
+            camera, the number of steps done and whether the goal is reached.
     """
     state = task.initial_state(model, placement)
     backend.reset(state)
@@ -135,11 +135,12 @@ def run_rollout(
     success_any = False
     reason = None
     step = 0
-    observation = backend.observe((skill.config.camera,))
+    observation = backend.observe(skill.cameras)
     if watch is not None:
-        watch(observation.cameras[skill.config.camera].rgb, step, False)
+        watch(observation.cameras[skill.cameras[0]].rgb, step, False)
     while step < round(task.horizon * RECORD_HZ):
-        action = skill.act(observation.cameras[skill.config.camera].rgb, observation.gripper)
+        images = {name: observation.cameras[name].rgb for name in skill.cameras}
+        action = skill.act(images, observation.gripper)
         desired, gripper = apply_action(controller.commanded_T_world_tool, action)
         try:
             targets = controller.move(desired, observation.T_world_tool, CONTROL_PER_RECORD)
@@ -150,12 +151,12 @@ def run_rollout(
             backend.command(q, gripper)
             backend.step()
         step += 1
-        observation = backend.observe((skill.config.camera,))
+        observation = backend.observe(skill.cameras)
         success = task.success(observation)
         success_any = success_any or success
         held = held + 1 if success else 0
         if watch is not None:
-            watch(observation.cameras[skill.config.camera].rgb, step, success)
+            watch(observation.cameras[skill.cameras[0]].rgb, step, success)
         if held >= round(task.hold * RECORD_HZ):
             break
     success = task.success(observation)

@@ -1,27 +1,41 @@
-"""Training windows over a dataset: picture history, gripper history, action.
+"""Training windows over a dataset: image history, gripper history, action.
 
-The demonstration and every episode (its segment, then the demonstration from t*) is one sequence.
+Each demonstration and every episode (its segment, then its demonstration from t*) is one sequence.
 Each sequence contributes a window for each of its steps, so the demonstration's steps count once
 for every trajectory that passes them (the paper's data). Windows that are equal are kept once,
-with that count as their multiplicity; pictures are kept once in any case.
+with that count as their multiplicity; images are kept once in any case.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sart_toolkit.data.records import CameraRecord, Dataset, Image, Steps, digest
-from sart_toolkit.errors import InvalidInput, Mismatch, unknown_name
+from sart_toolkit.data.records import (
+    CameraRecord,
+    Dataset,
+    Demonstration,
+    Steps,
+    actions_from_commands,
+    digest,
+)
+from sart_toolkit.data.storage import check_room, remove, replacing
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
+from sart_toolkit.learn.frames import FrameLayout, Frames, input_size
+from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.poses import Array
 
-Batch = tuple[Tensor, Tensor, Tensor]
+FRAMES, SAMPLES = "frames.bin", "samples.safetensors"
+
+Batch = dict[str, Tensor]
 
 # Smallest scale of each kind of action. A dimension that hardly moves must not be blown up: noise
 # there would weigh as much as motion in the others.
@@ -29,34 +43,6 @@ _RELATIVE_FLOOR = 0.1
 _TRANSLATION_FLOOR = 1e-4  # [m]
 _ROTATION_FLOOR = 1e-3  # [rad]
 _GRIPPER_FLOOR = 0.1
-
-
-def resize_area(rgb: Image, size: int) -> Image:
-    """The picture uint8 `(size, size, 3)`, each pixel the mean of the area it covers.
-
-    Computed in whole numbers up to the last division, hence the same to the bit everywhere, and
-    without BLAS, whose threads would cost far more than so small a product.
-
-    Args:
-        rgb: uint8 `(H, W, 3)`, of any height and width.
-        size: new height and width [pixels].
-    """
-    height, width = rgb.shape[:2]
-    if (height, width) == (size, size):
-        return rgb
-    rows = _area_sums(rgb.reshape(height, -1), size).reshape(size, width, 3)
-    columns = _area_sums(rows.swapaxes(0, 1).reshape(width, -1), size).reshape(size, size, 3)
-    return np.rint(columns.swapaxes(0, 1) / (height * width)).astype(np.uint8)
-
-
-def _area_sums(x: NDArray[Any], size: int) -> NDArray[np.int64]:
-    """Sums `(size, m)` of `x (n, m)` over `size` equal parts of its rows; a row counts `size`."""
-    n = len(x)
-    before = np.zeros((n + 1, x.shape[1]), np.int64)
-    np.cumsum(x, axis=0, out=before[1:])
-    whole, part = np.divmod(np.arange(size + 1) * n, size)
-    up_to_edge = size * before[whole] + part[:, None] * x[np.minimum(whole, n - 1)]
-    return np.diff(up_to_edge, axis=0)
 
 
 @dataclass(frozen=True)
@@ -70,61 +56,74 @@ class Normalisation:
 
 
 @dataclass(frozen=True)
-class Windows:
-    """All distinct windows of a dataset, as tensors on one device.
+class WindowConfig:
+    """What a window holds.
 
-    `frames (F, S + 2 pad, S + 2 pad, 3)` uint8: every picture once, its edge repeated `pad` times
-    around it. `gripper (F,)` float32: the gripper measured with it. `history (U, K)` int64: each
-    window's frames, oldest first. `actions (U, 7)` float32. `multiplicity (U,)` int64: how many
-    trajectories contribute the window.
+    `history` images of each of `cameras`, `image_size` [pixels] high, that can be shifted by up to
+    `image_shift` pixels; and the `chunk` actions that follow.
     """
 
-    frames: Tensor
+    cameras: tuple[str, ...]
+    image_size: int
+    history: int
+    image_shift: int = 0
+    chunk: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("image_size", 1), ("history", 1), ("image_shift", 0), ("chunk", 1)):
+            if getattr(self, name) < least:
+                raise InvalidInput(f"{name}: expected at least {least}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """All distinct windows of a dataset.
+
+    `frames`: each step's images, once. `gripper (F,)` float32: the gripper measured with them.
+    `history (U, K)` int64: each window's steps, oldest first. `actions (U, 7)` float32, or
+    `(U, chunk, 7)`. `multiplicity (U,)` int64: how many trajectories contribute the window.
+    `n_trajectories`: how many there are. `data_hash`: SHA-256 over all that training depends on.
+    """
+
+    frames: Frames
     gripper: Tensor
     history: Tensor
     actions: Tensor
     multiplicity: Tensor
-    pad: int = 0
+    n_trajectories: int
+    data_hash: str
 
     @property
-    def image_size(self) -> int:
-        """Height and width of a batch's pictures."""
-        return self.frames.shape[1] - 2 * self.pad
+    def device(self) -> torch.device:
+        """Where batches are gathered."""
+        return self.history.device
+
+    def to(self, device: torch.device) -> Windows:
+        """The same windows, with a copy of all images, in the memory of a device."""
+        moved = {
+            name: getattr(self, name).to(device)
+            for name in ("frames", "gripper", "history", "actions", "multiplicity")
+        }
+        return dataclasses.replace(self, **moved)
 
     def batch(self, windows: Tensor, offsets: Tensor | None = None) -> Batch:
-        """Frames uint8 `(B, K, 3, S, S)`, channels-last in memory, gripper `(B, K)`, actions.
+        """The named tensors of some windows, as `Policy` says.
 
         Args:
             windows: which windows, int64 `(B,)`.
-            offsets: rows and columns, int64 `(B, 2)` in 0..2 pad, at which each window's pictures
-                are cut from the padded ones: the same for all of a window's pictures. In the
-                middle when left out.
+            offsets: where each window's images are cut, see `Frames.gather`.
         """
         at = self.history[windows]
-        size = self.image_size
-        if self.pad == 0:
-            frames = self.frames.index_select(0, at.flatten()).unflatten(0, at.shape)
-            frames = frames.permute(0, 1, 4, 2, 3)
-        elif offsets is None:
-            middle = slice(self.pad, self.pad + size)
-            frames = self.frames[at][:, :, middle, middle].permute(0, 1, 4, 2, 3)
-        else:
-            cuts = self.frames.unfold(1, size, 1).unfold(2, size, 1).permute(0, 1, 2, 4, 5, 3)
-            frames = cuts[at, offsets[:, :1], offsets[:, 1:]].permute(0, 1, 4, 2, 3)
-        return frames, self.gripper[at], self.actions[windows]
+        images = self.frames.gather(at, offsets)
+        return {
+            **{f"images/{camera}": image for camera, image in images.items()},
+            "gripper": self.gripper[at],
+            "action": self.actions[windows],
+        }
 
-    def padded(self, pad: int) -> Windows:
-        """The same windows whose pictures can be shifted by up to `pad` pixels."""
-        size = self.image_size
-        inside = torch.arange(-pad, size + pad, device=self.frames.device).clamp(0, size - 1)
-        inside = inside + self.pad
-        frames = self.frames[:, inside][:, :, inside].contiguous()
-        return dataclasses.replace(self, frames=frames, pad=pad)
-
-    def to(self, device: torch.device) -> Windows:
-        """The same windows on another device."""
-        tensors = {k: v.to(device) for k, v in vars(self).items() if isinstance(v, Tensor)}
-        return Windows(**tensors, pad=self.pad)
+    def will_need(self, windows: Tensor) -> None:
+        """Say which windows come next, so that the disk has read them by then."""
+        self.frames.will_need(self.history[windows])
 
     def epoch_order(self, rng: np.random.Generator) -> NDArray[np.int64]:
         """One epoch's windows in random order, each as often as its multiplicity."""
@@ -140,7 +139,9 @@ class Windows:
         weights = self.multiplicity.cpu().numpy()
         gripper = self.gripper[self.history[:, -1]].cpu().numpy()[:, None]
         gripper_mean, gripper_std = _weighted_moments(gripper, weights)
-        action_mean, action_std = _weighted_moments(self.actions.cpu().numpy(), weights)
+        # Of a chunk, the first action: the others are other windows' first.
+        actions = self.actions.reshape(len(weights), -1, self.actions.shape[-1])[:, 0]
+        action_mean, action_std = _weighted_moments(actions.cpu().numpy(), weights)
         for kind, floor in (
             (slice(0, 3), _TRANSLATION_FLOOR),
             (slice(3, 6), _ROTATION_FLOOR),
@@ -151,85 +152,171 @@ class Windows:
         gripper_std = np.maximum(gripper_std, _GRIPPER_FLOOR)
         return Normalisation(gripper_mean, gripper_std, action_mean, action_std)
 
-    def content_hash(self) -> str:
-        """SHA-256 over all tensors: what a training run depends on."""
-        return digest({k: v.cpu().numpy() for k, v in vars(self).items() if isinstance(v, Tensor)})
 
+def open_windows(
+    dataset: Dataset,
+    config: WindowConfig,
+    directory: Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> Windows:
+    """The windows of a dataset, on the CPU, their images in a file that is mapped into memory.
 
-def build_windows(dataset: Dataset, camera: str, image_size: int, history: int) -> Windows:
-    """The windows of a dataset, on the CPU.
+    Only images, measured gripper and actions enter. A window that would begin before its
+    trajectory does repeats the trajectory's first step; a chunk that would end after it repeats
+    the last action, which holds still.
 
-    Only pictures, measured gripper and actions enter. A window that would begin before its
-    trajectory does repeats the trajectory's first frame.
+    The files in `directory` are written once, episode by episode, and used again for the same
+    dataset and `config`.
 
     Args:
-        dataset: the demonstration and its episodes; without episodes, the demonstration alone.
-        camera: whose pictures.
-        image_size: height and width [pixels] to which pictures are resized by area.
-        history: frames per window, at least 1.
+        dataset: demonstrations and their episodes; without episodes, the demonstrations alone.
+        config: what a window holds.
+        directory: where `frames.bin` and `samples.safetensors` are; made if needed.
+        progress: called with (read, in all) after each demonstration or episode.
 
     Raises:
-        InvalidInput: `image_size` or `history` below 1.
-        UnknownName: the demonstration has no such camera.
+        UnknownName: a demonstration has no such camera.
         Mismatch: an episode belongs to another demonstration, or was seen by another camera.
+        CannotWrite: the disk refuses, or has too little room.
     """
-    for name, value in (("image_size", image_size), ("history", history)):
-        if value < 1:
-            raise InvalidInput(f"{name}: expected at least 1, got {value}")
-    demonstration = dataset.demonstration
-    if camera not in demonstration.steps.cameras:
-        raise unknown_name("camera", camera, demonstration.steps.cameras)
-    reference = demonstration.steps.cameras[camera]
-    demonstration_hash = demonstration.content_hash()
+    layout = _layout(dataset, config)
+    key = digest({"dataset": dataset.content_hash(), **dataclasses.asdict(config)})
+    frames, samples = Path(directory) / FRAMES, Path(directory) / SAMPLES
+    try:
+        tensors, about = load_tensors(samples)
+        n_bytes = len(tensors["gripper"]) * layout.frame_bytes
+        usable = about.get("key") == key and frames.stat().st_size == n_bytes
+    except (MissingFile, BrokenFile, FileNotFoundError):
+        usable = False
+    if not usable:
+        remove(samples)
+        tensors, about = _write(dataset, config, layout, frames, progress)
+        # Last, so that frames with it are whole.
+        save_tensors(samples, tensors, {**about, "key": key})
+    return Windows(
+        Frames.in_file(frames, layout),
+        **tensors,
+        n_trajectories=about["n_trajectories"],
+        data_hash=about["data_hash"],
+    )
 
-    recordings: list[Steps] = [demonstration.steps]
-    sequences = [np.arange(len(demonstration))]
-    actions = [demonstration.actions]
-    n_frames = len(demonstration)
+
+def remove_windows(directory: Path) -> None:
+    """Remove what `open_windows` wrote.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    remove(Path(directory) / SAMPLES)
+    remove(Path(directory) / FRAMES)
+
+
+def _layout(dataset: Dataset, config: WindowConfig) -> FrameLayout:
+    cameras = dataset.demonstration.steps.cameras
+    for camera in config.cameras:
+        if camera not in cameras:
+            raise unknown_name("camera", camera, cameras)
+    sizes = {
+        camera: input_size(cameras[camera].rgb.shape[1:3], config.image_size)
+        for camera in config.cameras
+    }
+    return FrameLayout(sizes, config.image_shift)
+
+
+def _write(
+    dataset: Dataset,
+    config: WindowConfig,
+    layout: FrameLayout,
+    path: Path,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[dict[str, Tensor], dict[str, object]]:
+    """Write the frames' file; the windows' tensors, and what else is to be known of them."""
+    n_trajectories = 1 + len(dataset.episodes)
+    n_steps = len(dataset.demonstration) + sum(len(episode) for episode in dataset.episodes)
+    check_room(path, n_steps * layout.frame_bytes)
+
+    back, ahead = np.arange(-config.history + 1, 1), np.arange(config.chunk)
+    gripper: list[Array] = []
+    histories: list[NDArray[np.int64]] = []
+    chunks: list[NDArray[np.float32]] = []
+    n_written = 0
+    sha = hashlib.sha256()
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        for steps, following, actions in _trajectories(dataset, config.cameras):
+            packed = layout.pack(steps)
+            file.write(packed.data)
+            sha.update(packed.data)
+            gripper.append(steps.measured_gripper)
+            sequence = np.concatenate([np.arange(n_written, n_written + len(steps)), following])
+            histories.append(sequence[_clipped(len(sequence), back)])
+            chunks.append(actions.astype(np.float32)[_clipped(len(sequence), ahead)])
+            n_written += len(steps)
+            if progress is not None:
+                progress(len(histories), n_trajectories)
+
+    # The last step of a window determines what follows, so equal histories are equal windows.
+    windows, chosen, multiplicity = np.unique(
+        np.concatenate(histories), axis=0, return_index=True, return_counts=True
+    )
+    chunk = np.concatenate(chunks)[chosen]
+    arrays = {
+        "gripper": np.concatenate(gripper).astype(np.float32),
+        "history": windows,
+        "actions": chunk[:, 0] if config.chunk == 1 else chunk,
+        "multiplicity": multiplicity,
+    }
+    about = {
+        "n_trajectories": n_trajectories,
+        "data_hash": digest({"frames": sha.hexdigest(), **arrays}),
+    }
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}, about
+
+
+def _trajectories(
+    dataset: Dataset, cameras: tuple[str, ...]
+) -> Iterator[tuple[Steps, NDArray[np.int64], Array]]:
+    """For each trajectory its own steps, the numbers of those that follow them, and its actions.
+
+    Steps are numbered as they are yielded: an episode's are followed by its demonstration's.
+    """
+    shown: dict[str, tuple[Demonstration, int, Array]] = {}
+    n_yielded = 0
+    for demonstration in (dataset.demonstration,):
+        actions = demonstration.actions
+        shown[demonstration.content_hash()] = demonstration, n_yielded, actions
+        yield demonstration.steps, np.arange(0), actions
+        n_yielded += len(demonstration)
     for i, episode in enumerate(dataset.episodes):
-        t_star = episode.provenance.t_star
-        if episode.provenance.demonstration_hash != demonstration_hash:
+        t_star, sha = episode.provenance.t_star, episode.provenance.demonstration_hash
+        if sha not in shown:
             raise Mismatch(f"episode {i} was generated from another demonstration; generate again")
+        demonstration, first, actions = shown[sha]
         if not 0 <= t_star < len(demonstration):
             raise Mismatch(
                 f"episode {i} rejoins at step {t_star} of a demonstration of "
                 f"{len(demonstration)} steps; generate again"
             )
-        _check_same_camera(i, camera, episode.steps.cameras.get(camera), reference)
-        own = np.arange(n_frames, n_frames + len(episode))
-        sequences.append(np.concatenate([own, np.arange(t_star, len(demonstration))]))
-        actions.append(episode.actions(demonstration))
-        recordings.append(episode.steps)
-        n_frames += len(episode)
+        for camera in cameras:
+            reference = demonstration.steps.cameras[camera]
+            _check_same_camera(i, camera, episode.steps.cameras.get(camera), reference)
+        # `episode.actions(demonstration)`, of which those from t* on are known already.
+        n = len(episode)
+        commanded, gripper = episode.commands(demonstration)
+        own_actions = actions_from_commands(commanded[: n + 1], gripper[: n + 1])[:n]
+        following = first + np.arange(t_star, len(demonstration))
+        yield episode.steps, following, np.concatenate([own_actions, actions[t_star:]])
 
-    back = np.arange(-history + 1, 1)
-    all_windows = np.concatenate(
-        [sequence[np.clip(np.arange(len(sequence))[:, None] + back, 0, None)]
-         for sequence in sequences]
-    )  # fmt: skip
-    # The last frame of a window determines its action, so equal histories are equal windows.
-    windows, first, multiplicity = np.unique(
-        all_windows, axis=0, return_index=True, return_counts=True
-    )
-    pictures = [
-        resize_area(rgb, image_size) for steps in recordings for rgb in steps.cameras[camera].rgb
-    ]
-    return Windows(
-        frames=torch.from_numpy(np.stack(pictures)),
-        gripper=torch.from_numpy(
-            np.concatenate([steps.measured_gripper for steps in recordings]).astype(np.float32)
-        ),
-        history=torch.from_numpy(windows),
-        actions=torch.from_numpy(np.concatenate(actions)[first].astype(np.float32)),
-        multiplicity=torch.from_numpy(multiplicity),
-    )
+
+def _clipped(n: int, around: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each of `n` steps the steps `around` it, those beyond the ends replaced by the ends."""
+    return np.clip(np.arange(n)[:, None] + around, 0, n - 1)
 
 
 def _check_same_camera(
     i: int, name: str, camera: CameraRecord | None, reference: CameraRecord
 ) -> None:
     if camera is None:
-        raise Mismatch(f"episode {i} has no pictures of camera {name!r}; generate again with it")
+        raise Mismatch(f"episode {i} has no images of camera {name!r}; generate again with it")
     if (
         camera.rgb.shape[1:] != reference.rgb.shape[1:]
         or not np.allclose(camera.intrinsics, reference.intrinsics)

@@ -7,13 +7,14 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from sart_toolkit.data import storage
 from sart_toolkit.data.records import (
+    ACTION_SIZE,
     Annotation,
     Dataset,
     Demonstration,
@@ -21,8 +22,9 @@ from sart_toolkit.data.records import (
     library_versions,
 )
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, SartError
-from sart_toolkit.learn.model import Policy
-from sart_toolkit.learn.samples import resize_area
+from sart_toolkit.learn.frames import input_size, resize_area
+from sart_toolkit.learn.policy import Policy
+from sart_toolkit.learn.samples import remove_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.training import (
     CHECKPOINT,
@@ -33,48 +35,81 @@ from sart_toolkit.learn.training import (
 )
 from sart_toolkit.poses import Array, check_array, check_pose, frozen
 
+_T = TypeVar("_T")
+
 # A gripper that is told to open and to close knows two; more stand for a finger on a trigger.
 _FEW_GRIPPER_COMMANDS = 4
 
 
 @dataclass(frozen=True)
-class SkillConfig:
-    """What must be known to execute a skill elsewhere.
+class SkillCamera:
+    """A camera as it was in the demonstration.
 
-    The task and its parameters, robot and backend it was shown on; the camera by name, its
-    recorded `(height, width)` [pixels], `intrinsics (3, 3)` and `T_tool_camera (4, 4)`; the
-    demonstration's content hash; and how it was trained.
+    `size` is the recorded `(height, width)` [pixels]; `intrinsics (3, 3)` in pixels;
+    `T_tool_camera (4, 4)`.
     """
 
-    task: str
-    task_parameters: Mapping[str, Any]
-    robot: str
-    backend: str
-    camera: str
-    recorded_size: tuple[int, int]
+    size: tuple[int, int]
     intrinsics: Array
     T_tool_camera: Array
-    demonstration_hash: str
-    training: TrainConfig
 
     def __post_init__(self) -> None:
-        size = tuple(self.recorded_size)
+        size = tuple(self.size)
         if len(size) != 2 or not all(isinstance(n, int) and n > 0 for n in size):
-            raise InvalidInput(f"recorded_size: expected (height, width) [pixels], got {size}")
-        object.__setattr__(self, "recorded_size", size)
+            raise InvalidInput(f"size: expected (height, width) [pixels], got {size}")
+        object.__setattr__(self, "size", size)
         intrinsics = check_array("intrinsics", self.intrinsics, (3, 3))
         object.__setattr__(self, "intrinsics", frozen(intrinsics))
         T_tool_camera = check_pose("T_tool_camera", self.T_tool_camera)
         object.__setattr__(self, "T_tool_camera", frozen(T_tool_camera))
 
     def to_json(self) -> dict[str, Any]:
+        """The camera as JSON values."""
+        return {
+            "size": list(self.size),
+            "intrinsics": self.intrinsics.tolist(),
+            "T_tool_camera": self.T_tool_camera.tolist(),
+        }
+
+
+@dataclass(frozen=True)
+class SkillConfig:
+    """What must be known to execute a skill elsewhere.
+
+    The task and its parameters, robot and backend it was shown on; the `cameras` it sees by name;
+    the demonstration's content hash; and how it was trained.
+    """
+
+    task: str
+    task_parameters: Mapping[str, Any]
+    robot: str
+    backend: str
+    cameras: Mapping[str, SkillCamera]
+    demonstration_hash: str
+    training: TrainConfig
+
+    def __post_init__(self) -> None:
+        if set(self.cameras) != set(self.training.cameras):
+            raise InvalidInput(
+                f"cameras: expected {', '.join(self.training.cameras)} as in training, got "
+                f"{', '.join(self.cameras) or 'none'}"
+            )
+
+    @property
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """`(height, width)` [pixels] of the images that the policy sees, by camera, in order."""
+        training = self.training
+        return {
+            name: input_size(self.cameras[name].size, training.image_size)
+            for name in training.cameras
+        }
+
+    def to_json(self) -> dict[str, Any]:
         """The configuration as JSON values."""
         return {
             **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},
             "task_parameters": dict(self.task_parameters),
-            "recorded_size": list(self.recorded_size),
-            "intrinsics": self.intrinsics.tolist(),
-            "T_tool_camera": self.T_tool_camera.tolist(),
+            "cameras": {name: camera.to_json() for name, camera in self.cameras.items()},
             "training": self.training.to_json(),
         }
 
@@ -86,13 +121,26 @@ class SkillConfig:
             InvalidInput: a key is missing or unknown, or a value is not acceptable.
             UnknownName: an unknown policy or training option.
         """
-        names = {field.name for field in dataclasses.fields(cls)}
-        if wrong := sorted(names ^ value.keys()):
-            problem = "is missing" if wrong[0] in names else "is unknown"
-            raise InvalidInput(
-                f"skill configuration: {wrong[0]!r} {problem}; train the skill again"
-            )
-        return cls(**{**value, "training": TrainConfig.from_json(value["training"])})
+        _check_keys("skill configuration", value, cls)
+        cameras = {}
+        for name, camera in _named("cameras", value["cameras"]).items():
+            _check_keys(f"camera {name!r} of the skill configuration", camera, SkillCamera)
+            cameras[name] = SkillCamera(**camera)
+        training = TrainConfig.from_json(value["training"])
+        return cls(**{**value, "cameras": cameras, "training": training})
+
+
+def _named(what: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise InvalidInput(f"{what}: expected values by name, got {value!r}")
+    return value
+
+
+def _check_keys(what: str, value: Any, record: type) -> None:
+    names = {field.name for field in dataclasses.fields(record)}
+    if wrong := sorted(names ^ _named(what, value).keys()):
+        problem = "is missing" if wrong[0] in names else "is unknown"
+        raise InvalidInput(f"{what}: {wrong[0]!r} {problem}; train the skill again")
 
 
 class Skill:
@@ -121,47 +169,70 @@ class Skill:
         self._device = resolve_device(device)
         self._policy = policy.to(self._device).eval()
         self._gripper_commands = np.unique(demonstration.steps.commanded_gripper)
-        self._pictures: deque[Image] = deque(maxlen=config.training.history)
-        self._gripper: deque[float] = deque(maxlen=config.training.history)
+        history = config.training.history
+        self._images: dict[str, deque[Image]] = {
+            name: deque(maxlen=history) for name in config.training.cameras
+        }
+        self._gripper: deque[float] = deque(maxlen=history)
+        self._chunk: deque[Array] = deque()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The names of the cameras that it sees."""
+        return self.config.training.cameras
 
     def reset(self) -> None:
         """Forget the history: the next `act` starts a new execution."""
-        self._pictures.clear()
+        self._policy.reset()
+        for images in self._images.values():
+            images.clear()
         self._gripper.clear()
+        self._chunk.clear()
 
-    def act(self, rgb: Image, gripper: float) -> Array:
+    def act(self, images: Mapping[str, Image], gripper: float) -> Array:
         """The action `(7,)`: xyz [m], rotation vector [rad], tool frame; gripper target in [0, 1].
 
-        Where the demonstration knew a few gripper commands only, the nearest of them is given.
+        Where the policy predicts several actions at once, they are given one after the other
+        before it is asked again. Where the demonstration knew a few gripper commands only, the
+        nearest of them is given.
 
         Args:
-            rgb: what the skill's camera sees now, uint8 `(H, W, 3)` of any size; resized exactly
-                as in training.
+            images: what the skill's `cameras` see now, by name, uint8 `(H, W, 3)` of any size;
+                resized exactly as in training. Other cameras' are left aside.
             gripper: measured gripper in [0, 1] (0 open).
 
         Raises:
-            InvalidInput: not such a picture, or the gripper is not a finite number.
+            InvalidInput: a camera's image is missing or isn't one, the gripper is not a finite
+                number, or the policy predicts no action.
         """
-        rgb = np.asarray(rgb)
-        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or rgb.size == 0:
-            raise InvalidInput(
-                f"rgb: expected uint8 of shape (H, W, 3), got {rgb.dtype} {rgb.shape}"
-            )
+        seen = {name: _checked_image(name, images) for name in self.cameras}
         if not np.isfinite(gripper):
             raise InvalidInput(f"gripper: expected a number in [0, 1], got {gripper}")
-        self._pictures.append(resize_area(rgb, self.config.training.image_size))
-        self._gripper.append(float(gripper))
-        while len(self._pictures) < self.config.training.history:
-            self._pictures.appendleft(self._pictures[0])
-            self._gripper.appendleft(self._gripper[0])
-        frames = torch.from_numpy(np.stack(self._pictures)).permute(0, 3, 1, 2)[None]
+        for name, size in self.config.image_sizes.items():
+            _remember(self._images[name], resize_area(seen[name], size))
+        _remember(self._gripper, float(gripper))
+        if not self._chunk:
+            self._chunk.extend(self._predict())
+        action = self._chunk.popleft()
+        action[6] = self._commandable(action[6])
+        return action
+
+    def _predict(self) -> Array:
+        """The next actions `(k, 7)`."""
+        observation = {
+            f"images/{name}": torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+            for name, images in self._images.items()
+        }
+        observation["gripper"] = torch.tensor(list(self._gripper))
         with torch.inference_mode():
-            action = self._policy(
-                frames.to(self._device), torch.tensor([list(self._gripper)], device=self._device)
+            predicted = self._policy.predict(
+                {name: value[None].to(self._device) for name, value in observation.items()}
             )
-        values = action[0].double().cpu().numpy()
-        values[6] = self._commandable(values[6])
-        return values
+        actions = predicted[0].double().cpu().numpy()
+        actions = check_array("predicted actions", np.atleast_2d(actions), (None, ACTION_SIZE))
+        if not len(actions):
+            raise InvalidInput("predicted actions: expected at least one, got none")
+        return actions
 
     def _commandable(self, gripper: float) -> float:
         """The gripper target itself, or the nearest of the few that the demonstration commanded.
@@ -175,12 +246,31 @@ class Skill:
         return float(shown[np.argmin(np.abs(shown - gripper))])
 
 
+def _checked_image(camera: str, images: Mapping[str, Image]) -> Image:
+    if camera not in images:
+        raise InvalidInput(
+            f"images: expected one of camera {camera!r}, got {', '.join(images) or 'none'}"
+        )
+    rgb = np.asarray(images[camera])
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or rgb.size == 0:
+        raise InvalidInput(
+            f"image of camera {camera!r}: expected uint8 of shape (H, W, 3), got {rgb.dtype} "
+            f"{rgb.shape}"
+        )
+    return rgb
+
+
+def _remember(history: deque[_T], newest: _T) -> None:
+    """Add to a history, which begins full of what was observed first."""
+    history.extend([newest] * (1 if history else history.maxlen or 1))
+
+
 def save_skill(
     path: Path, result: TrainResult, dataset: Dataset, overwrite: bool = False
 ) -> SkillConfig:
     """Write a skill directory; `config.json` comes last, so that a directory with it is whole.
 
-    A training checkpoint in the directory is removed: the skill takes its place.
+    A training's checkpoint and windows in the directory are removed: the skill takes their place.
 
     Raises:
         OutputExists: there is a skill already and `overwrite` is false.
@@ -190,16 +280,18 @@ def save_skill(
     storage.check_writable(path / "config.json", overwrite)
     storage.remove(path / "config.json")
     demonstration = dataset.demonstration
-    camera = demonstration.steps.cameras[result.config.camera]
+    recorded = {name: demonstration.steps.cameras[name] for name in result.config.cameras}
     config = SkillConfig(
         task=demonstration.task,
         task_parameters=demonstration.task_parameters,
         robot=demonstration.robot,
         backend=demonstration.backend,
-        camera=result.config.camera,
-        recorded_size=(camera.rgb.shape[1], camera.rgb.shape[2]),
-        intrinsics=camera.intrinsics,
-        T_tool_camera=camera.T_tool_camera,
+        cameras={
+            name: SkillCamera(
+                (camera.rgb.shape[1], camera.rgb.shape[2]), camera.intrinsics, camera.T_tool_camera
+            )
+            for name, camera in recorded.items()
+        },
         demonstration_hash=demonstration.content_hash(),
         training=result.config,
     )
@@ -213,7 +305,7 @@ def save_skill(
             "seconds": result.seconds,
             "images_per_second": result.images_per_second,
             "windows": result.n_windows,
-            "trajectories": 1 + len(dataset.episodes),
+            "trajectories": result.n_trajectories,
             "device": result.device,
             "bfloat16": result.bfloat16,
             "config": result.config.to_json(),
@@ -227,6 +319,7 @@ def save_skill(
     )
     storage.write_json(path / "config.json", config.to_json())
     storage.remove(path / CHECKPOINT)
+    remove_windows(path)
     return config
 
 
@@ -266,7 +359,7 @@ def load_skill(path: Path, device: str = "cpu") -> Skill:
                 f"{path / name}: belongs to another demonstration than config.json; copy the "
                 "whole skill directory again"
             )
-    policy = build_policy(config.training)
+    policy = build_policy(config.training, config.image_sizes)
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as error:

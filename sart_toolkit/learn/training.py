@@ -22,9 +22,9 @@ from torch import Tensor
 from sart_toolkit.data.records import Dataset
 from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
-from sart_toolkit.learn.model import Policy
-from sart_toolkit.learn.policies import get_encoder
-from sart_toolkit.learn.samples import build_windows
+from sart_toolkit.learn.policies import get_policy
+from sart_toolkit.learn.policy import Policy, PolicySetup
+from sart_toolkit.learn.samples import WindowConfig, Windows, open_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.poses import check_positive
 
@@ -42,11 +42,11 @@ class TrainConfig:
 
     `epochs` passes over all trajectories in batches of `batch_size` windows; AdamW with `lr` and
     `weight_decay`; `schedule` is "cosine" (5 % linear warm-up, then down to 0) or "constant".
-    `history` pictures of `camera`, resized to `image_size` [pixels]; each window shifted by up to
-    `image_shift` pixels at random. `hidden`: width of the head. `norm`: the encoder's normalisation
-    layers. `backbone_weights`: a file of weights to start from. `bfloat16`: "auto", "on" or "off".
-    `device`: "auto", "cpu" or "cuda". `threads`: torch's threads, its own choice if None. `seed`
-    decides the initial weights, the order and the shifts.
+    `history` images of each of `cameras`, resized to a height of `image_size` [pixels]; each window
+    shifted by up to `image_shift` pixels at random. `hidden`: width of the head. `norm`: the
+    policy's normalisation layers. `backbone_weights`: a file of weights to start from. `bfloat16`:
+    "auto", "on" or "off". `device`: "auto", "cpu" or "cuda". `threads`: torch's threads, its own
+    choice if None. `seed` decides the initial weights, the order and the shifts.
     """
 
     policy: str
@@ -60,7 +60,7 @@ class TrainConfig:
     norm: str
     history: int = 2
     hidden: int = 512
-    camera: str = "wrist"
+    cameras: tuple[str, ...] = ("wrist",)
     backbone_weights: str | None = None
     bfloat16: str = "auto"
     device: str = "auto"
@@ -68,7 +68,11 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        encoder = get_encoder(self.policy)
+        norms = get_policy(self.policy).norms
+        cameras = tuple(self.cameras)
+        if not cameras or len(set(cameras)) < len(cameras):
+            raise InvalidInput(f"cameras: expected different names, at least one, got {cameras}")
+        object.__setattr__(self, "cameras", cameras)
         for name, least in (
             ("epochs", 1),
             ("batch_size", 2),
@@ -93,7 +97,7 @@ class TrainConfig:
             ("schedule", ("cosine", "constant")),
             ("bfloat16", ("auto", "on", "off")),
             ("device", ("auto", "cpu", "cuda")),
-            ("norm", encoder.norms),
+            ("norm", norms),
         ):
             if getattr(self, name) not in choices:
                 raise InvalidInput(
@@ -109,7 +113,7 @@ class TrainConfig:
             UnknownName: no such policy, or no such option.
             InvalidInput: a value is not acceptable.
         """
-        return cls.from_json({"policy": policy, **get_encoder(policy).train_defaults, **overrides})
+        return cls.from_json({"policy": policy, **get_policy(policy).train_defaults, **overrides})
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> TrainConfig:
@@ -131,7 +135,7 @@ class TrainConfig:
 
     def to_json(self) -> dict[str, Any]:
         """The configuration as JSON values."""
-        return dataclasses.asdict(self)
+        return {**dataclasses.asdict(self), "cameras": list(self.cameras)}
 
 
 @dataclass(frozen=True)
@@ -147,8 +151,8 @@ class EpochRecord:
 class TrainResult:
     """A trained policy (on the CPU, in evaluation mode) and how its training went.
 
-    `images_per_second` counts every picture of every window's history. `bfloat16` and `device`
-    are what "auto" came to.
+    `images_per_second` counts every image of every window, those of all its cameras. `bfloat16`
+    and `device` are what "auto" came to.
     """
 
     policy: Policy
@@ -156,6 +160,7 @@ class TrainResult:
     curve: tuple[EpochRecord, ...]
     images_per_second: float
     n_windows: int
+    n_trajectories: int
     device: str
     bfloat16: bool
 
@@ -170,14 +175,17 @@ class TrainResult:
         return sum(record.seconds for record in self.curve)
 
 
-def build_policy(config: TrainConfig) -> Policy:
-    """An untrained policy with the initial weights that `config.seed` decides, on the CPU."""
-    encoder_class = get_encoder(config.policy)
+def build_policy(config: TrainConfig, image_sizes: Mapping[str, tuple[int, int]]) -> Policy:
+    """An untrained policy with the initial weights that `config.seed` decides, on the CPU.
+
+    Args:
+        config: which policy.
+        image_sizes: `(height, width)` [pixels] of the images that it sees, by camera.
+    """
+    setup = PolicySetup(image_sizes, config.history, config.hidden, config.norm)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        policy = Policy(
-            encoder_class(config.image_size, config.norm), config.history, config.hidden
-        )
+        policy = get_policy(config.policy)(setup)
     # torch's type stubs leave this argument out. Convolutions on a CPU are several times faster so.
     return policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
@@ -232,68 +240,81 @@ def train(
     out: Path,
     progress: Progress | None = None,
     resume: bool = True,
+    reading: Callable[[int, int], None] | None = None,
 ) -> TrainResult:
     """A policy trained on a dataset.
 
-    Checkpoints go to `out` every 30 seconds, at the end, and when interrupted (Ctrl-C lets the step
-    finish, a second one does not). A later call with the same dataset and options goes on
-    from there, and ends with the weights of an uninterrupted run, bit for bit on the same CPU with
-    the same number of threads.
+    The dataset is read once, into files in `out` (see `open_windows`) from which batches are
+    gathered. Checkpoints go to `out` every 30 seconds, at the end, and when interrupted (Ctrl-C
+    lets the step finish, a second one does not). A later call with the same dataset and options
+    resumes from there, and ends with the weights of an uninterrupted run, bit for bit on the same
+    CPU with the same number of threads.
 
     Args:
         dataset: the demonstration and its episodes.
         config: how to train.
-        out: directory of the checkpoint; made if needed.
+        out: directory of the checkpoint and the windows; made if needed.
         progress: called after every step with steps done, steps in all, and a line of text.
-        resume: go on from a checkpoint in `out` if there is one; otherwise it is replaced.
+        resume: resume from a checkpoint in `out` if there is one; otherwise it is replaced.
+        reading: called after each trajectory of the dataset that was read, with how many of how
+            many.
 
     Raises:
         UnknownName: the dataset has no such camera.
-        InvalidInput: CUDA was asked for and isn't there, or the encoder takes no backbone weights.
+        InvalidInput: CUDA was asked for and isn't there, or the policy takes no backbone weights.
         Mismatch: the dataset's parts don't belong together, the checkpoint is of other options or
             another dataset, or the backbone weights don't fit.
         MissingFile: no such backbone weights.
         BrokenFile: damaged checkpoint or backbone weights.
-        CannotWrite: the disk refuses the checkpoint.
+        CannotWrite: the disk refuses the checkpoint, or has no room for the images.
         SartError: the loss is not finite any more.
     """
     device = resolve_device(config.device)
     check_writable(Path(out) / CHECKPOINT, overwrite=True)
+    windows = open_windows(dataset, _window_config(config), Path(out), reading)
     with _torch_threads(config.threads), _deferred_interrupt() as interrupted:
-        return _Training(dataset, config, Path(out), device, resume).run(progress, interrupted)
+        return _Training(windows, config, Path(out), device, resume).run(progress, interrupted)
+
+
+def _window_config(config: TrainConfig) -> WindowConfig:
+    return WindowConfig(
+        config.cameras,
+        config.image_size,
+        config.history,
+        config.image_shift,
+        get_policy(config.policy).chunk,
+    )
 
 
 class _Training:
     """What a run changes as it goes: weights, optimizer, and the place in the epoch."""
 
     def __init__(
-        self, dataset: Dataset, config: TrainConfig, out: Path, device: torch.device, resume: bool
+        self, windows: Windows, config: TrainConfig, out: Path, device: torch.device, resume: bool
     ) -> None:
         self.config = config
         self.device = device
         self.bfloat16 = resolve_bfloat16(config.bfloat16, device)
         self.checkpoint = out / CHECKPOINT
-        windows = build_windows(dataset, config.camera, config.image_size, config.history)
         # Where it ran decides rounding, not what is learned: those options may change.
         self.options = {k: v for k, v in config.to_json().items() if k not in ("device", "threads")}
-        self.data_hash = windows.content_hash()
         self.n_windows = int(windows.multiplicity.sum())
         self.n_batches = math.ceil(self.n_windows / config.batch_size)
 
-        going_on = resume and self.checkpoint.exists()
-        self.policy = build_policy(config)
+        resumes = resume and self.checkpoint.exists()
+        self.policy = build_policy(config, windows.frames.layout.sizes)
         self.policy.set_normalisation(windows.normalisation())
-        if config.backbone_weights is not None and not going_on:
-            self.policy.encoder.load_backbone(Path(config.backbone_weights))
+        if config.backbone_weights is not None and not resumes:
+            self.policy.load_backbone(Path(config.backbone_weights))
         self.policy.to(device)
         self.optimizer = make_optimizer(self.policy, config)
-        self.windows = windows.padded(config.image_shift).to(device)
+        self.windows = windows.to(device) if _has_room(device, windows) else windows
 
         self.curve: list[EpochRecord] = []
         self.batch = 0
         self.loss_sum = torch.zeros((), dtype=torch.float64, device=device)
         self.seconds = 0.0
-        if going_on:
+        if resumes:
             self._restore()
 
     def run(self, progress: Progress | None, interrupted: Callable[[], bool]) -> TrainResult:
@@ -307,6 +328,8 @@ class _Training:
                 step = epoch * self.n_batches + batch
                 for group in self.optimizer.param_groups:
                     group["lr"] = learning_rate(config, step, n_steps)
+                if batch + 1 < self.n_batches:
+                    self.windows.will_need(batches[batch + 1][0])
                 self._step(*batches[batch])
                 self.batch = batch + 1
                 if progress is not None:
@@ -316,7 +339,7 @@ class _Training:
                     self._save()
                     saved = time.perf_counter()
                 if interrupted():
-                    _log.warning("interrupted after step %d; train again to go on", step + 1)
+                    _log.warning("interrupted after step %d; train again to resume", step + 1)
                     raise KeyboardInterrupt
             loss = self._finite_loss() / self.n_windows
             self.curve.append(EpochRecord(epoch + 1, loss, time.perf_counter() - began))
@@ -329,9 +352,10 @@ class _Training:
         rng = np.random.default_rng([self.config.seed, epoch])
         order = self.windows.epoch_order(rng)
         offsets = rng.integers(0, 2 * self.config.image_shift + 1, (len(order), 2))
+        device = self.windows.device
         # Batches that differ by at most one window: a small last batch would disturb BatchNorm.
         return [
-            (torch.from_numpy(a).to(self.device), torch.from_numpy(b).to(self.device))
+            (torch.from_numpy(a).to(device), torch.from_numpy(b).to(device))
             for a, b in zip(
                 np.array_split(order, self.n_batches),
                 np.array_split(offsets, self.n_batches),
@@ -340,9 +364,9 @@ class _Training:
         ]
 
     def _step(self, windows: Tensor, offsets: Tensor) -> None:
-        frames, gripper, actions = self.windows.batch(windows, offsets)
+        batch = {k: v.to(self.device) for k, v in self.windows.batch(windows, offsets).items()}
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            loss = self.policy.loss(frames, gripper, actions)
+            loss = self.policy.loss(batch)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
@@ -364,13 +388,14 @@ class _Training:
 
     def _result(self) -> TrainResult:
         seconds = sum(record.seconds for record in self.curve)
-        n_images = self.n_windows * self.config.history * len(self.curve)
+        n_images = self.n_windows * self.config.history * len(self.config.cameras) * len(self.curve)
         return TrainResult(
             policy=self.policy.cpu().eval(),
             config=self.config,
             curve=tuple(self.curve),
             images_per_second=n_images / seconds,
             n_windows=self.n_windows,
+            n_trajectories=self.windows.n_trajectories,
             device=self.device.type,
             bfloat16=self.bfloat16,
         )
@@ -382,7 +407,7 @@ class _Training:
                 tensors[f"optimizer/{i}/{name}"] = value
         about = {
             "options": self.options,
-            "data_hash": self.data_hash,
+            "data_hash": self.windows.data_hash,
             "batch": self.batch,
             "loss_sum": self._finite_loss(),
             "seconds": self.seconds,
@@ -393,7 +418,7 @@ class _Training:
     def _restore(self) -> None:
         tensors, about = load_tensors(self.checkpoint)
         changed = [k for k, v in self.options.items() if about["options"].get(k) != v]
-        if about["data_hash"] != self.data_hash:
+        if about["data_hash"] != self.windows.data_hash:
             changed.append("training data")
         if changed:
             raise Mismatch(
@@ -409,6 +434,8 @@ class _Training:
                 }
             )
             for i, parameter in enumerate(self.policy.parameters()):
+                if f"optimizer/{i}/step" not in tensors:
+                    continue  # a weight that isn't trained
                 moments = {
                     # The moments must lie in memory as the weights do.
                     name: torch.empty_like(parameter).copy_(tensors[f"optimizer/{i}/{name}"])
@@ -424,6 +451,14 @@ class _Training:
         self.batch, self.seconds = about["batch"], about["seconds"]
         self.loss_sum.fill_(about["loss_sum"])
         self.curve = [EpochRecord(**record) for record in about["curve"]]
+
+
+def _has_room(device: torch.device, windows: Windows) -> bool:
+    """Whether a GPU can hold all images and as much again for the policy."""
+    if device.type != "cuda":
+        return False
+    free, _ = torch.cuda.mem_get_info(device)
+    return 2 * sum(images.nbytes for images in windows.frames.images.values()) < free
 
 
 @contextlib.contextmanager

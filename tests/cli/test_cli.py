@@ -227,6 +227,8 @@ def test_unknown_names_offer_the_nearest_and_leave_nothing(
     assert "image_size: expected at least 16 pixels, got 8" in said
     said = error(capsys, "train", chain / "data", "--out", out, "--policy", "compact")
     assert "did you mean 'compact_mlp'" in said
+    said = error(capsys, "train", chain / "data", "--out", out, "--cameras", "wrist,overwiev")
+    assert "unknown camera 'overwiev'" in said
     said = error(
         capsys, "augment", chain / "demo.h5", chain / "annotation.json", "--out", out,
         "--strategy", "sert",

@@ -6,6 +6,7 @@ import errno
 import functools
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -33,6 +34,7 @@ from sart_toolkit.data.storage import (
     annotation_from_json,
     annotation_to_json,
     append_json_line,
+    check_room,
     check_writable,
     clear_directory,
     episode_name,
@@ -780,6 +782,14 @@ def test_an_output_in_a_folder_that_may_not_be_written_is_refused(tmp_path, monk
 def test_an_output_with_a_name_that_the_disk_does_not_take_is_refused(tmp_path):
     with pytest.raises(CannotWrite, match="File name too long"):
         check_writable(tmp_path / ("x" * 300))
+
+
+def test_a_disk_has_room_or_says_how_much_is_missing(tmp_path):
+    path = tmp_path / "new" / "x.bin"
+    check_room(path, shutil.disk_usage(tmp_path).free // 2)
+    with pytest.raises(CannotWrite, match=r"x.bin: needs 1000000000.0 GB and \d+.\d GB are free"):
+        check_room(path, 10**18)
+    assert not path.parent.exists()
 
 
 def test_remove_takes_files_and_folders_and_what_is_not_there(tmp_path):

@@ -34,16 +34,15 @@ class Player:
 
     def __init__(self, actions=()):
         self.actions = [np.array(action) for action in actions]
-        self.config = SimpleNamespace(
-            camera="wrist", robot="ur5e_2f85", training=SimpleNamespace(policy="player")
-        )
+        self.config = SimpleNamespace(robot="ur5e_2f85", training=SimpleNamespace(policy="player"))
+        self.cameras = ("wrist",)
         self.seen = []
 
     def reset(self):
         self.seen = []
 
-    def act(self, rgb, gripper):
-        self.seen.append((rgb, gripper))
+    def act(self, images, gripper):
+        self.seen.append((images["wrist"], gripper))
         at = len(self.seen) - 1
         return self.actions[at] if at < len(self.actions) else STILL
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from sart_toolkit.data.records import (
     Provenance,
     Steps,
 )
+from sart_toolkit.learn.samples import WindowConfig, Windows, open_windows
 from sart_toolkit.learn.training import TrainConfig
 from sart_toolkit.poses import pose
 
@@ -108,6 +112,20 @@ def perturbed(steps: Steps) -> Steps:
     )
 
 
+def with_overview(dataset: Dataset, size: tuple[int, int] = (24, 36)) -> Dataset:
+    """The dataset seen by a second camera with other, rectangular images."""
+
+    def add(steps: Steps) -> Steps:
+        wrist = steps.cameras["wrist"]
+        rgb = np.resize(wrist.rgb, (len(wrist.rgb), *size, 3))
+        overview = CameraRecord(
+            rgb, np.zeros(rgb.shape[:3], np.float32), np.eye(3), pose((0.0, 0.0, 1.0))
+        )
+        return dataclasses.replace(steps, cameras={**steps.cameras, "overview": overview})
+
+    return with_steps(dataset, add)
+
+
 def with_steps(dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
     """The dataset with all steps changed, and hashes that match again."""
     demonstration = dataclasses.replace(
@@ -121,7 +139,8 @@ def with_steps(dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
         )
         for episode in dataset.episodes
     )
-    return Dataset(demonstration, dataset.annotation, episodes)
+    annotation = dataclasses.replace(dataset.annotation, demonstration_hash=sha)
+    return Dataset(demonstration, annotation, episodes)
 
 
 @pytest.fixture(name="make_dataset")
@@ -139,9 +158,25 @@ def _with_steps() -> Callable[[Dataset, Callable[[Steps], Steps]], Dataset]:
     return with_steps
 
 
+@pytest.fixture(name="open_windows")
+def _open_windows(tmp_path: Path) -> Callable[..., Windows]:
+    """`open_windows` in an empty directory each time, of the wrist camera unless told."""
+
+    def opened(dataset: Dataset, image_size: int = 16, history: int = 2, **options: Any) -> Windows:
+        config = WindowConfig(options.pop("cameras", ("wrist",)), image_size, history, **options)
+        return open_windows(dataset, config, Path(tempfile.mkdtemp(dir=tmp_path)))
+
+    return opened
+
+
 @pytest.fixture
 def dataset() -> Dataset:
     return make_dataset()
+
+
+@pytest.fixture
+def two_cameras(dataset: Dataset) -> Dataset:
+    return with_overview(dataset)
 
 
 @pytest.fixture

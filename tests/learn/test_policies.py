@@ -1,15 +1,14 @@
-import inspect
-
 import pytest
 import torch
 from safetensors.torch import save_file
 from torch import nn
 
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, UnknownName
-from sart_toolkit.learn.model import Policy
-from sart_toolkit.learn.policies import POLICIES, get_encoder
-from sart_toolkit.learn.policies.encoder import Encoder, read_state_dict
-from sart_toolkit.learn.policies.resnet18_mlp import ResNet18, ResNet18Encoder
+from sart_toolkit.learn.policies import POLICIES, get_policy
+from sart_toolkit.learn.policies.compact_mlp import CompactEncoder
+from sart_toolkit.learn.policies.encoder import read_state_dict
+from sart_toolkit.learn.policies.resnet18_mlp import ResNet18
+from sart_toolkit.learn.policy import Policy
 from sart_toolkit.learn.training import TrainConfig, build_policy
 
 
@@ -58,43 +57,83 @@ def test_group_norm_has_the_same_names_without_running_statistics():
     assert found == {name for name in _torchvision_resnet18() if not name.endswith(gone)}
 
 
+class _Recorded(dict[str, torch.Tensor]):
+    """Named tensors that remember which of them were asked for."""
+
+    def __init__(self, tensors):
+        super().__init__(tensors)
+        self.asked = set()
+
+    def __getitem__(self, name):
+        self.asked.add(name)
+        return super().__getitem__(name)
+
+
+def _observation(n, **sizes):
+    images = {
+        f"images/{camera}": torch.randint(0, 256, (n, 2, 3, *size), dtype=torch.uint8)
+        for camera, size in sizes.items()
+    }
+    return _Recorded({**images, "gripper": torch.rand(n, 2)})
+
+
 @pytest.mark.parametrize("policy", sorted(POLICIES))
-def test_a_policy_takes_pictures_and_gripper_and_nothing_else(policy):
-    assert list(inspect.signature(Policy.forward).parameters) == ["self", "frames", "gripper"]
-    encoder = get_encoder(policy)
-    assert list(inspect.signature(encoder.forward).parameters) == ["self", "pictures"]
+def test_a_policy_takes_images_and_gripper_and_nothing_else(policy):
+    sizes = {"wrist": (32, 32), "overview": (32, 48)}
+    config = TrainConfig.for_policy(policy, cameras=tuple(sizes), hidden=8)
+    model = build_policy(config, sizes).eval()
+    observation = _observation(2, **sizes)
+    observation["joint_positions"] = torch.rand(2, 6)
+    model.predict(observation)
+    assert observation.asked == {"images/wrist", "images/overview", "gripper"}
+    observation["action"] = torch.rand(2, 7)
+    model.loss(observation)
+    assert observation.asked == {"images/wrist", "images/overview", "gripper", "action"}
 
 
 @pytest.mark.parametrize(
-    ("policy", "norm"), [(p, n) for p in sorted(POLICIES) for n in get_encoder(p).norms]
+    ("policy", "norm"), [(p, n) for p in sorted(POLICIES) for n in get_policy(p).norms]
 )
-def test_every_policy_maps_uint8_windows_to_actions(policy, norm):
-    config = TrainConfig.for_policy(policy, norm=norm, image_size=33, image_shift=0, hidden=8)
-    model = build_policy(config).eval()
-    frames = torch.randint(0, 256, (2, 2, 3, 33, 33), dtype=torch.uint8)
-    actions = model(frames, torch.rand(2, 2))
+@pytest.mark.parametrize("sizes", [{"wrist": (33, 33)}, {"wrist": (33, 20), "top": (18, 33)}])
+def test_every_policy_maps_uint8_windows_to_actions(policy, norm, sizes):
+    config = TrainConfig.for_policy(policy, norm=norm, hidden=8, cameras=tuple(sizes))
+    model = build_policy(config, sizes).eval()
+    actions = model.predict(_observation(2, **sizes))
     assert actions.shape == (2, 7) and actions.dtype == torch.float32
     assert not torch.equal(actions[0], actions[1])
-    assert set(get_encoder(policy).train_defaults) <= set(config.to_json())
+    assert set(get_policy(policy).train_defaults) <= set(config.to_json())
+
+
+def test_cameras_share_the_encoders_class_and_not_its_weights():
+    sizes = {"wrist": (32, 32), "overview": (32, 48)}
+    config = TrainConfig.for_policy("compact_mlp", cameras=tuple(sizes))
+    wrist, overview = build_policy(config, sizes).encoders
+    assert type(wrist) is type(overview)
+    assert not torch.equal(wrist.layers[0].weight, overview.layers[0].weight)
 
 
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_normalisation_is_part_of_the_state_dict(policy):
-    names = set(build_policy(TrainConfig.for_policy(policy)).state_dict())
+    model = build_policy(TrainConfig.for_policy(policy), {"wrist": (32, 32)})
+    names = set(model.state_dict())
     assert {"image_mean", "image_scale", "gripper_mean", "action_mean", "action_std"} <= names
 
 
 def test_the_soft_argmax_finds_a_blob_to_a_fraction_of_a_pixel():
-    encoder = get_encoder("compact_mlp")(64, "none")
+    encoder = CompactEncoder((64, 96), "none")
     with torch.no_grad():
         encoder.layers = nn.AvgPool2d(4)  # type: ignore[assignment]
-        x, y = torch.meshgrid(torch.linspace(-1, 1, 64), torch.linspace(-1, 1, 64), indexing="xy")
+        x, y = torch.meshgrid(torch.linspace(-1, 1, 96), torch.linspace(-1, 1, 64), indexing="xy")
         blob = -((x - 0.31) ** 2 + (y + 0.17) ** 2) / 0.04
-        features = encoder(blob.expand(1, 3, 64, 64))
-    # Pixel centres of the pooled map lie at +-(1 - 3/63) of the picture's.
-    scale = 1 - 3 / 63
-    assert features[0, 0].item() == pytest.approx(0.31 / scale, abs=0.01)
-    assert features[0, 3].item() == pytest.approx(-0.17 / scale, abs=0.01)
+        features = encoder(blob.expand(1, 3, 64, 96))
+    # Pixel centres of the pooled map lie at +-(1 - 3/(n - 1)) of the image's.
+    assert features[0, 0].item() == pytest.approx(0.31 / (1 - 3 / 95), abs=0.01)
+    assert features[0, 3].item() == pytest.approx(-0.17 / (1 - 3 / 63), abs=0.01)
+
+
+def _resnet18_mlp(norm="batch", cameras=("wrist",)):
+    config = TrainConfig.for_policy("resnet18_mlp", norm=norm, cameras=cameras)
+    return build_policy(config, dict.fromkeys(cameras, (64, 64)))
 
 
 @pytest.mark.parametrize("suffix", [".pth", ".pt", ".safetensors"])
@@ -104,11 +143,10 @@ def test_backbone_weights_are_loaded_with_or_without_fc(tmp_path, suffix):
         del state["fc.weight"], state["fc.bias"]
     path = tmp_path / f"weights{suffix}"
     save_file(state, path) if suffix == ".safetensors" else torch.save(state, path)
-    encoder = ResNet18Encoder(64, "batch")
-    encoder.load_backbone(path)
-    assert all(
-        (tensor == 0.5).all() for k, tensor in encoder.state_dict().items() if "num" not in k
-    )
+    policy = _resnet18_mlp(cameras=("wrist", "overview"))
+    policy.load_backbone(path)
+    loaded = {k: v for k, v in policy.encoders.state_dict().items() if "num" not in k}
+    assert len(loaded) == 200 and all((tensor == 0.5).all() for tensor in loaded.values())
 
 
 @pytest.mark.parametrize(
@@ -128,13 +166,13 @@ def test_backbone_weights_that_do_not_fit_are_refused(tmp_path, change, message)
     change(state)
     save_file(state, tmp_path / "weights.safetensors")
     with pytest.raises(Mismatch, match=message):
-        ResNet18Encoder(64, "batch").load_backbone(tmp_path / "weights.safetensors")
+        _resnet18_mlp().load_backbone(tmp_path / "weights.safetensors")
 
 
 def test_batch_norm_weights_are_refused_by_group_norm_with_the_remedy(tmp_path):
     save_file(ResNet18().state_dict(), tmp_path / "weights.safetensors")
     with pytest.raises(Mismatch, match="also holds .* --norm batch"):
-        ResNet18Encoder(64, "group").load_backbone(tmp_path / "weights.safetensors")
+        _resnet18_mlp("group").load_backbone(tmp_path / "weights.safetensors")
 
 
 def test_missing_backbone_weights_are_refused(tmp_path):
@@ -170,16 +208,23 @@ def test_a_file_of_anything_but_tensors_is_refused(tmp_path):
         read_state_dict(tmp_path / "weights.pth")
 
 
-def test_an_encoder_without_published_weights_says_so(tmp_path):
-    with pytest.raises(InvalidInput, match="CompactEncoder takes no --backbone-weights"):
-        get_encoder("compact_mlp")(64, "none").load_backbone(tmp_path / "weights.pth")
+def test_a_policy_without_published_weights_says_so(tmp_path):
+    policy = build_policy(TrainConfig.for_policy("compact_mlp"), {"wrist": (64, 64)})
+    with pytest.raises(InvalidInput, match="CompactMLP takes no --backbone-weights"):
+        policy.load_backbone(tmp_path / "weights.pth")
 
 
 def test_an_unknown_policy_is_refused_with_the_nearest():
     with pytest.raises(UnknownName, match="did you mean 'compact_mlp'"):
-        get_encoder("compact_mpl")
+        get_policy("compact_mpl")
 
 
-def test_every_entry_of_the_table_is_an_encoder():
+def test_every_entry_of_the_table_is_a_policy():
     for name in POLICIES:
-        assert issubclass(get_encoder(name), Encoder)
+        assert issubclass(get_policy(name), Policy)
+
+
+def test_what_is_no_policy_is_refused(monkeypatch):
+    monkeypatch.setitem(POLICIES, "resnet", "sart_toolkit.learn.policies.resnet18_mlp:ResNet18")
+    with pytest.raises(InvalidInput, match="policy 'resnet': expected a subclass of Policy, got"):
+        get_policy("resnet")

@@ -1,4 +1,6 @@
 import dataclasses
+import resource
+import shutil
 from collections import Counter
 
 import numpy as np
@@ -6,8 +8,8 @@ import pytest
 import torch
 
 from sart_toolkit.data.records import Dataset
-from sart_toolkit.errors import InvalidInput, Mismatch, UnknownName
-from sart_toolkit.learn.samples import build_windows, resize_area
+from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, UnknownName
+from sart_toolkit.learn.samples import FRAMES, SAMPLES, WindowConfig, open_windows, remove_windows
 from sart_toolkit.poses import pose
 
 
@@ -36,46 +38,49 @@ def _expected_windows(dataset, history):
 
 @pytest.mark.parametrize("history", [1, 2, 3])
 @pytest.mark.parametrize("t_stars", [(), (0,), (3, 5, 5), (8, 1, 8, 2)])
-def test_windows_are_exactly_the_steps_of_all_trajectories(make_dataset, history, t_stars):
+def test_windows_are_exactly_the_steps_of_all_trajectories(
+    make_dataset, history, t_stars, open_windows
+):
     dataset = make_dataset(t_stars)
-    windows = build_windows(dataset, "wrist", 32, history)
-    frames, gripper, actions = windows.batch(torch.arange(len(windows.history)))
+    windows = open_windows(dataset, 32, history)
+    batch = windows.batch(torch.arange(len(windows.history)))
+    images, gripper, actions = batch["images/wrist"], batch["gripper"], batch["action"]
     found = {
         (f.permute(0, 2, 3, 1).numpy().tobytes(), tuple(g.numpy()), tuple(a.numpy())): int(m)
-        for f, g, a, m in zip(frames, gripper, actions, windows.multiplicity, strict=True)
+        for f, g, a, m in zip(images, gripper, actions, windows.multiplicity, strict=True)
     }
     assert found == dict(_expected_windows(dataset, history))
     assert len(found) == len(windows.history)
 
 
-def test_each_picture_is_stored_once(make_dataset):
+def test_each_picture_is_stored_once(make_dataset, open_windows):
     dataset = make_dataset((2,) * 20)
-    windows = build_windows(dataset, "wrist", 16, 2)
-    assert len(windows.frames) == len(dataset.demonstration) + 20 * 4
+    windows = open_windows(dataset)
+    assert len(windows.frames.images["wrist"]) == len(dataset.demonstration) + 20 * 4
 
 
-def test_the_first_window_repeats_the_first_frame(dataset):
-    windows = build_windows(dataset, "wrist", 16, 3)
+def test_the_first_window_repeats_the_first_frame(dataset, open_windows):
+    windows = open_windows(dataset, 16, 3)
     assert [0, 0, 0] in windows.history.tolist()
     assert [0, 0, 1] in windows.history.tolist()
 
 
-def test_the_window_at_the_join_holds_the_segments_last_frame(dataset):
-    windows = build_windows(dataset, "wrist", 16, 2)
+def test_the_window_at_the_join_holds_the_segments_last_frame(dataset, open_windows):
+    windows = open_windows(dataset)
     # Demonstration 0..8, first episode's segment 9..12, then the demonstration from t* = 3.
     assert [12, 3] in windows.history.tolist()
 
 
-def test_the_shared_suffix_counts_once_for_every_trajectory(dataset):
-    windows = build_windows(dataset, "wrist", 16, 2)
+def test_the_shared_suffix_counts_once_for_every_trajectory(dataset, open_windows):
+    windows = open_windows(dataset)
     count = {tuple(h): int(m) for h, m in zip(windows.history, windows.multiplicity, strict=True)}
     count = {tuple(int(i) for i in h): m for h, m in count.items()}
     # t* = 3, 5, 5: the step after t* is the first whose history lies in the demonstration.
     assert [count[t - 1, t] for t in range(1, 9)] == [1, 1, 1, 2, 2, 4, 4, 4]
 
 
-def test_an_epoch_passes_every_step_of_every_trajectory_once(dataset):
-    windows = build_windows(dataset, "wrist", 16, 2)
+def test_an_epoch_passes_every_step_of_every_trajectory_once(dataset, open_windows):
+    windows = open_windows(dataset)
     order = windows.epoch_order(np.random.default_rng(0))
     assert (np.bincount(order) == windows.multiplicity.numpy()).all()
     assert len(order) == 9 + (4 + 6) + 2 * (4 + 4)
@@ -83,66 +88,170 @@ def test_an_epoch_passes_every_step_of_every_trajectory_once(dataset):
     assert (order == windows.epoch_order(np.random.default_rng(0))).all()
 
 
-def test_joints_forces_and_measured_poses_never_enter(dataset, perturbed, with_steps):
-    plain = build_windows(dataset, "wrist", 16, 2)
-    other = build_windows(with_steps(dataset, perturbed), "wrist", 16, 2)
-    assert plain.content_hash() == other.content_hash()
+def test_joints_forces_and_measured_poses_never_enter(dataset, perturbed, with_steps, open_windows):
+    plain = open_windows(dataset)
+    other = open_windows(with_steps(dataset, perturbed))
+    assert plain.data_hash == other.data_hash
 
 
-def test_where_in_the_world_it_happened_never_enters(dataset, with_steps):
+def test_where_in_the_world_it_happened_never_enters(dataset, with_steps, open_windows):
     def moved(steps):
         T = pose((1.0, -2.0, 0.5), (0.3, 0.2, -1.0))
         return dataclasses.replace(steps, commanded_Ts_world_tool=T @ steps.commanded_Ts_world_tool)
 
-    plain = build_windows(dataset, "wrist", 16, 2)
-    other = build_windows(with_steps(dataset, moved), "wrist", 16, 2)
+    plain = open_windows(dataset)
+    other = open_windows(with_steps(dataset, moved))
     assert torch.allclose(plain.actions, other.actions, atol=1e-7)
-    assert torch.equal(plain.frames, other.frames)
+    assert torch.equal(plain.frames.images["wrist"], other.frames.images["wrist"])
 
 
-def test_area_resizing_averages_the_area_of_each_pixel():
-    rng = np.random.default_rng(0)
-    rgb = rng.integers(0, 256, (12, 18, 3), dtype=np.uint8)
-    exact = rgb.reshape(6, 2, 6, 3, 3).mean((1, 3))
-    assert (resize_area(rgb, 6) == np.rint(exact)).all()
-    # 12 -> 8: each new pixel covers one and a half old ones.
-    fine = np.repeat(np.repeat(rgb[:, :12], 2, 0), 2, 1).reshape(8, 3, 8, 3, 3)
-    assert (resize_area(rgb[:, :12], 8) == np.rint(fine.mean((1, 3)))).all()
-    # 12 -> 24: each old pixel becomes four.
-    assert (resize_area(rgb[:, :12], 24) == np.repeat(np.repeat(rgb[:, :12], 2, 0), 2, 1)).all()
-    assert (resize_area(rgb[:12, :12], 12) == rgb[:12, :12]).all()
-    assert (resize_area(np.full((50, 31, 3), 77, np.uint8), 64) == 77).all()
-
-
-def test_shifts_move_all_of_a_windows_pictures_alike_and_repeat_the_edge(dataset):
-    windows = build_windows(dataset, "wrist", 16, 2)
-    padded = windows.padded(3)
+def test_shifts_move_all_of_a_windows_images_alike_and_repeat_the_edge(dataset, open_windows):
+    padded = open_windows(dataset, image_shift=3)
     chosen = torch.tensor([4, 7, 2])
-    plain, gripper, actions = windows.batch(chosen)
+    plain = open_windows(dataset).batch(chosen)
     offsets = torch.tensor([[0, 0], [3, 3], [5, 1]])
-    shifted, same_gripper, same_actions = padded.batch(chosen, offsets)
-    for picture, result, (row, column) in zip(plain, shifted, offsets.tolist(), strict=True):
+    shifted = padded.batch(chosen, offsets)
+    for image, result, (row, column) in zip(
+        plain["images/wrist"], shifted["images/wrist"], offsets.tolist(), strict=True
+    ):
         rows = np.clip(np.arange(16) + row - 3, 0, 15)
         columns = np.clip(np.arange(16) + column - 3, 0, 15)
-        assert torch.equal(picture[:, :, rows][:, :, :, columns], result)
-    assert torch.equal(gripper, same_gripper) and torch.equal(actions, same_actions)
-    assert torch.equal(padded.batch(chosen)[0], plain)
-    assert torch.equal(padded.padded(1).batch(chosen)[0], plain)
-    assert padded.image_size == windows.image_size == 16
+        assert torch.equal(image[:, :, rows][:, :, :, columns], result)
+    assert torch.equal(plain["gripper"], shifted["gripper"])
+    assert torch.equal(plain["action"], shifted["action"])
+    assert torch.equal(padded.batch(chosen)["images/wrist"], plain["images/wrist"])
 
 
-def test_batches_are_channels_last(dataset):
-    windows = build_windows(dataset, "wrist", 16, 2)
-    for frames in (
-        windows.batch(torch.arange(4))[0],
-        windows.padded(2).batch(torch.arange(4), torch.ones(4, 2, dtype=torch.int64))[0],
-    ):
-        assert frames.shape == (4, 2, 3, 16, 16) and frames.dtype == torch.uint8
-        assert frames.flatten(0, 1).is_contiguous(memory_format=torch.channels_last)
+def test_a_batch_is_images_gripper_and_action_and_nothing_else(two_cameras, open_windows):
+    windows = open_windows(two_cameras, cameras=("wrist", "overview"))
+    batch = windows.batch(torch.arange(4))
+    assert {name: (tuple(v.shape), v.dtype) for name, v in batch.items()} == {
+        "images/wrist": ((4, 2, 3, 16, 16), torch.uint8),
+        "images/overview": ((4, 2, 3, 16, 24), torch.uint8),
+        "gripper": ((4, 2), torch.float32),
+        "action": ((4, 7), torch.float32),
+    }
 
 
-def test_normalisation_weighs_trajectories_and_floors_what_hardly_moves(dataset):
-    windows = build_windows(dataset, "wrist", 16, 2)
+@pytest.mark.parametrize("shift", [0, 2])
+def test_each_cameras_images_are_those_it_has_alone(two_cameras, open_windows, shift):
+    chosen, offsets = (
+        torch.tensor([3, 8, 1]),
+        torch.tensor([[0, 1], [2, 2], [1, 0]]).clamp(max=shift * 2),
+    )
+    both = open_windows(two_cameras, cameras=("overview", "wrist"), image_shift=shift)
+    for camera in ("wrist", "overview"):
+        alone = open_windows(two_cameras, cameras=(camera,), image_shift=shift)
+        name = f"images/{camera}"
+        expected = alone.batch(chosen, offsets)[name]
+        assert torch.equal(both.batch(chosen, offsets)[name], expected)
+
+
+@pytest.mark.parametrize("shift", [0, 2])
+def test_batches_are_channels_last(two_cameras, open_windows, shift):
+    windows = open_windows(two_cameras, cameras=("wrist", "overview"), image_shift=shift)
+    batch = windows.batch(torch.arange(4), torch.full((4, 2), shift))
+    for camera in ("wrist", "overview"):
+        images = batch[f"images/{camera}"].flatten(0, 1)
+        assert images.is_contiguous(memory_format=torch.channels_last)
+
+
+def test_a_chunk_holds_the_actions_that_follow_and_then_holds_still(dataset, open_windows):
+    windows = open_windows(dataset, chunk=4)
+    single = open_windows(dataset)
+    assert torch.equal(windows.history, single.history)
+    assert torch.equal(windows.actions[:, 0], single.actions)
+    at = {tuple(h): i for i, h in enumerate(single.history.tolist())}
+    # The first episode: its segment is 9..12, then the demonstration from t* = 3.
+    following = [at[11, 12], at[12, 3], at[3, 4], at[4, 5]]
+    assert torch.equal(windows.actions[at[11, 12]], single.actions[following])
+    last = at[7, 8]
+    assert torch.equal(windows.actions[last], single.actions[[last] * 4])
+    assert windows.normalisation().action_mean == pytest.approx(single.normalisation().action_mean)
+
+
+def test_the_files_are_used_again_for_the_same_dataset_and_windows(make_dataset, tmp_path):
+    read = []
+
+    def opened(dataset=None, **options):
+        config = WindowConfig(**{"cameras": ("wrist",), "image_size": 16, "history": 2, **options})
+        before = len(read)
+        windows = open_windows(
+            dataset or make_dataset(), config, tmp_path, lambda *n: read.append(n)
+        )
+        return windows, len(read) - before
+
+    first, n = opened()
+    assert n == 4 and read[-1] == (4, 4)
+    again, n = opened()
+    assert n == 0 and again.data_hash == first.data_hash
+    assert torch.equal(again.batch(torch.arange(9))["images/wrist"],
+                       first.batch(torch.arange(9))["images/wrist"])  # fmt: skip
+    for other in ({"image_shift": 1}, {"history": 3}, {"chunk": 2}, {"image_size": 20}):
+        assert opened(**other)[1] == 4
+    other, n = opened(make_dataset(seed=1))
+    assert n == 4 and other.data_hash != first.data_hash
+
+
+@pytest.mark.parametrize("name", [FRAMES, SAMPLES])
+@pytest.mark.parametrize("damage", ["cut", "gone"])
+def test_damaged_files_are_written_again(dataset, tmp_path, name, damage):
+    config = WindowConfig(("wrist",), 16, 2)
+    first = open_windows(dataset, config, tmp_path)
+    images = first.frames.images["wrist"].clone()
+    if damage == "cut":
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).unlink()  # what is mapped must not shrink
+        (tmp_path / name).write_bytes(content[:-50])
+    else:
+        (tmp_path / name).unlink()
+    again = open_windows(dataset, config, tmp_path)
+    assert torch.equal(again.frames.images["wrist"], images)
+    assert torch.equal(again.history, first.history)
+
+
+def test_reading_that_was_interrupted_leaves_nothing_that_would_be_used(dataset, tmp_path):
+    def interrupt(done, total):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    config = WindowConfig(("wrist",), 16, 2)
+    with pytest.raises(KeyboardInterrupt):
+        open_windows(dataset, config, tmp_path, interrupt)
+    assert list(tmp_path.iterdir()) == []
+    assert len(open_windows(dataset, config, tmp_path).history) > 0
+
+
+def test_windows_are_removed(dataset, tmp_path):
+    open_windows(dataset, WindowConfig(("wrist",), 16, 2), tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [FRAMES, SAMPLES]
+    remove_windows(tmp_path)
+    remove_windows(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_without_room_is_refused_before_anything_is_read(dataset, tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    read = []
+    with pytest.raises(CannotWrite, match=r"frames.bin: needs 0.0 GB and 0.0 GB are free; make"):
+        open_windows(dataset, WindowConfig(("wrist",), 16, 2), tmp_path, lambda *n: read.append(n))
+    assert not read
+
+
+def test_a_disk_that_fills_up_is_told_and_leaves_nothing(dataset, tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+    try:
+        with pytest.raises(CannotWrite, match=r"frames.bin: File too large; nothing was replaced"):
+            open_windows(dataset, WindowConfig(("wrist",), 32, 2), tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_normalisation_weighs_trajectories_and_floors_what_hardly_moves(dataset, open_windows):
+    windows = open_windows(dataset)
     repeated = windows.actions.double().repeat_interleave(windows.multiplicity, 0).numpy()
     normalisation = windows.normalisation()
     assert np.allclose(normalisation.action_mean, repeated.mean(0))
@@ -152,15 +261,18 @@ def test_normalisation_weighs_trajectories_and_floors_what_hardly_moves(dataset)
     assert (normalisation.action_std[3:6] == 1e-3).all()
 
 
-@pytest.mark.parametrize("name", ["image_size", "history"])
-def test_a_size_below_one_is_refused(dataset, name):
-    with pytest.raises(InvalidInput, match=f"{name}: expected at least 1, got 0"):
-        build_windows(dataset, "wrist", **{"image_size": 16, "history": 2, name: 0})
+@pytest.mark.parametrize(
+    ("name", "least"), [("image_size", 1), ("history", 1), ("image_shift", 0), ("chunk", 1)]
+)
+def test_a_size_out_of_range_is_refused(name, least):
+    options = {"cameras": ("wrist",), "image_size": 16, "history": 2, name: least - 1}
+    with pytest.raises(InvalidInput, match=f"{name}: expected at least {least}, got {least - 1}"):
+        WindowConfig(**options)
 
 
-def test_an_unknown_camera_is_refused_with_the_nearest(dataset):
+def test_an_unknown_camera_is_refused_with_the_nearest(dataset, open_windows):
     with pytest.raises(UnknownName, match="did you mean 'wrist'"):
-        build_windows(dataset, "wirst", 16, 2)
+        open_windows(dataset, cameras=("wirst",))
 
 
 def _with_last(dataset, steps=None, **provenance):
@@ -173,25 +285,25 @@ def _with_last(dataset, steps=None, **provenance):
     return Dataset(dataset.demonstration, dataset.annotation, (*dataset.episodes[:-1], changed))
 
 
-def test_an_episode_of_another_demonstration_is_refused(dataset):
+def test_an_episode_of_another_demonstration_is_refused(dataset, open_windows):
     with pytest.raises(Mismatch, match="episode 2 was generated from another demonstration"):
-        build_windows(_with_last(dataset, demonstration_hash="0"), "wrist", 16, 2)
+        open_windows(_with_last(dataset, demonstration_hash="0"))
 
 
 @pytest.mark.parametrize("t_star", [-1, 9])
-def test_an_episode_that_rejoins_nowhere_is_refused(dataset, t_star):
+def test_an_episode_that_rejoins_nowhere_is_refused(dataset, t_star, open_windows):
     with pytest.raises(Mismatch, match=f"episode 2 rejoins at step {t_star} of a demonstration"):
-        build_windows(_with_last(dataset, t_star=t_star), "wrist", 16, 2)
+        open_windows(_with_last(dataset, t_star=t_star))
 
 
-def test_an_episode_without_the_camera_is_refused(dataset):
+def test_an_episode_without_the_camera_is_refused(dataset, open_windows):
     steps = dataclasses.replace(dataset.episodes[-1].steps, cameras={})
-    with pytest.raises(Mismatch, match="episode 2 has no pictures of camera 'wrist'"):
-        build_windows(_with_last(dataset, steps), "wrist", 16, 2)
+    with pytest.raises(Mismatch, match="episode 2 has no images of camera 'wrist'"):
+        open_windows(_with_last(dataset, steps))
 
 
 @pytest.mark.parametrize("field", ["intrinsics", "T_tool_camera", "size"])
-def test_an_episode_seen_by_another_camera_is_refused(dataset, field):
+def test_an_episode_seen_by_another_camera_is_refused(dataset, field, open_windows):
     steps = dataset.episodes[-1].steps
     camera = steps.cameras["wrist"]
     if field == "size":
@@ -202,4 +314,4 @@ def test_an_episode_seen_by_another_camera_is_refused(dataset, field):
         camera = dataclasses.replace(camera, **{field: value})
     steps = dataclasses.replace(steps, cameras={"wrist": camera})
     with pytest.raises(Mismatch, match="episode 2: camera 'wrist' has another size, intrinsics or"):
-        build_windows(_with_last(dataset, steps), "wrist", 16, 2)
+        open_windows(_with_last(dataset, steps))

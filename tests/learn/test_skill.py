@@ -1,5 +1,4 @@
 import dataclasses
-import inspect
 import json
 import shutil
 
@@ -9,7 +8,8 @@ import torch
 
 from sart_toolkit.data import storage
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, OutputExists
-from sart_toolkit.learn.samples import build_windows
+from sart_toolkit.learn.policy import Policy, PolicySetup
+from sart_toolkit.learn.samples import FRAMES
 from sart_toolkit.learn.skill import Skill, SkillConfig, load_skill, save_skill
 from sart_toolkit.learn.training import CHECKPOINT, train
 
@@ -45,19 +45,28 @@ def test_a_skill_is_the_files_of_the_design(trained):
     assert (training["windows"], training["trajectories"]) == (35, 4)
 
 
-def test_a_skill_acts_as_the_policy_did_in_training(trained, dataset):
-    path, result = trained
-    skill = load_skill(path)
-    windows = build_windows(dataset, "wrist", 16, 2)
-    steps = dataset.demonstration.steps
+def _images(steps, t):
+    return {name: camera.rgb[t] for name, camera in steps.cameras.items()}
+
+
+@pytest.mark.parametrize("cameras", [("wrist",), ("overview", "wrist")])
+def test_a_skill_acts_as_the_policy_did_in_training(
+    two_cameras, small_config, open_windows, tmp_path, cameras
+):
+    config = dataclasses.replace(small_config, cameras=cameras)
+    result = train(two_cameras, config, tmp_path)
+    save_skill(tmp_path, result, two_cameras)
+    skill = load_skill(tmp_path)
+    assert skill.cameras == cameras
+    windows = open_windows(two_cameras, cameras=cameras)
+    steps = two_cameras.demonstration.steps
     for _ in range(2):
         skill.reset()
         for t in range(len(steps)):
             at = windows.history.tolist().index([max(0, t - 1), t])
-            frames, gripper, _ = windows.batch(torch.tensor([at]))
             with torch.inference_mode():
-                expected = result.policy(frames, gripper)[0].numpy()
-            action = skill.act(steps.cameras["wrist"].rgb[t], float(steps.measured_gripper[t]))
+                expected = result.policy.predict(windows.batch(torch.tensor([at])))[0].numpy()
+            action = skill.act(_images(steps, t), float(steps.measured_gripper[t]))
             assert action.shape == (7,) and action.dtype == np.float64
             assert np.allclose(action[:6], expected[:6], atol=1e-7)
             # Shown only open or closed, so commanded so.
@@ -65,7 +74,7 @@ def test_a_skill_acts_as_the_policy_did_in_training(trained, dataset):
 
 
 @pytest.mark.parametrize("few", [True, False])
-def test_the_gripper_is_told_what_was_shown_unless_that_was_much(trained, dataset, few):
+def test_the_gripper_is_commanded_as_was_shown_unless_that_was_much(trained, dataset, few):
     demonstration = dataset.demonstration
     shown = np.linspace(0, 0.8, 3 if few else len(demonstration.steps))
     commands = np.resize(shown, len(demonstration.steps))
@@ -73,25 +82,96 @@ def test_the_gripper_is_told_what_was_shown_unless_that_was_much(trained, datase
     skill = load_skill(trained[0])
     other = dataclasses.replace(demonstration, steps=steps)
     skill = Skill(skill._policy, skill.config, other, skill.annotation, skill.training)
-    told = {
-        skill.act(rgb, gripper)[6]
+    commanded = {
+        skill.act({"wrist": rgb}, gripper)[6]
         for rgb, gripper in zip(
             demonstration.steps.cameras["wrist"].rgb, np.linspace(0, 1, len(steps)), strict=True
         )
     }
-    assert (told <= set(shown)) == few
+    assert (commanded <= set(shown)) == few
 
 
-def test_a_skill_sees_pictures_and_gripper_and_nothing_else():
-    assert list(inspect.signature(Skill.act).parameters) == ["self", "rgb", "gripper"]
+class _Spy(Policy):
+    """Remembers what it observes; predicts chunks of three actions."""
+
+    def __init__(self, setup):
+        super().__init__(setup)
+        self.seen, self.n_resets = [], 0
+        self.predicted = torch.arange(21.0).reshape(1, 3, 7)
+
+    def loss(self, batch):
+        raise NotImplementedError
+
+    def predict(self, observation):
+        self.seen.append(observation)
+        return self.predicted
+
+    def reset(self):
+        self.n_resets += 1
 
 
-def test_a_skill_takes_pictures_of_any_size(trained):
+@pytest.fixture
+def spied(trained):
+    skill = load_skill(trained[0])
+    spy = _Spy(PolicySetup(skill.config.image_sizes, 2, 8, "none"))
+    return Skill(spy, skill.config, skill.demonstration, skill.annotation, skill.training), spy
+
+
+def test_a_policy_sees_images_and_gripper_and_nothing_else(spied):
+    skill, spy = spied
+    skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.25)
+    (seen,) = spy.seen
+    assert {name: tuple(tensor.shape) for name, tensor in seen.items()} == {
+        "images/wrist": (1, 2, 3, 16, 16),
+        "gripper": (1, 2),
+    }
+    assert seen["gripper"].tolist() == [[0.25, 0.25]]
+
+
+def test_a_chunk_is_executed_before_the_policy_is_asked_again(spied):
+    skill, spy = spied
+    for step in range(4):
+        image = np.full((32, 32, 3), step, np.uint8)
+        action = skill.act({"wrist": image}, step / 10)
+        assert action[:6].tolist() == [7.0 * (step % 3) + i for i in range(6)]
+    assert len(spy.seen) == 2
+    # What was seen meanwhile is part of the history.
+    assert spy.seen[1]["gripper"].tolist() == [[pytest.approx(0.2), pytest.approx(0.3)]]
+    assert spy.seen[1]["images/wrist"][0, :, 0, 0, 0].tolist() == [2, 3]
+
+
+def test_a_reset_ends_the_chunk_and_reaches_the_policy(spied):
+    skill, spy = spied
+    image = np.zeros((32, 32, 3), np.uint8)
+    skill.act({"wrist": image}, 0.0)
+    skill.reset()
+    skill.act({"wrist": image}, 1.0)
+    assert len(spy.seen) == 2 and spy.n_resets == 1
+    assert spy.seen[1]["gripper"].tolist() == [[1.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("predicted", "message"),
+    [
+        (torch.zeros(1, 6), r"predicted actions: expected shape \('n', 7\), got \(1, 6\)"),
+        (torch.zeros(7), r"predicted actions: expected shape \('n', 7\), got \(1, 1\)"),
+        (torch.zeros(1, 0, 7), "predicted actions: expected at least one, got none"),
+        (torch.full((1, 7), torch.nan), "predicted actions: has NaN"),
+    ],
+)
+def test_a_policy_that_predicts_no_actions_is_refused(spied, predicted, message):
+    skill, spy = spied
+    spy.predicted = predicted
+    with pytest.raises(InvalidInput, match=message):
+        skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.0)
+
+
+def test_a_skill_takes_images_of_any_size(trained):
     skill = load_skill(trained[0])
     rgb = np.full((32, 32, 3), 90, np.uint8)
-    first = skill.act(rgb, 0.5)
+    first = skill.act({"wrist": rgb}, 0.5)
     skill.reset()
-    assert np.allclose(skill.act(np.full((48, 20, 3), 90, np.uint8), 0.5), first)
+    assert np.allclose(skill.act({"wrist": np.full((48, 20, 3), 90, np.uint8)}, 0.5), first)
 
 
 def test_a_skill_says_where_it_came_from(trained, dataset):
@@ -100,8 +180,8 @@ def test_a_skill_says_where_it_came_from(trained, dataset):
     assert skill.annotation.demonstration_hash == dataset.annotation.demonstration_hash
     config = skill.config
     assert (config.task, config.robot, config.backend) == ("blob", "none", "synthetic")
-    assert (config.camera, config.recorded_size) == ("wrist", (32, 32))
-    assert np.allclose(config.T_tool_camera[:3, 3], [0.05, 0, -0.1])
+    assert list(config.cameras) == ["wrist"] and config.cameras["wrist"].size == (32, 32)
+    assert np.allclose(config.cameras["wrist"].T_tool_camera[:3, 3], [0.05, 0, -0.1])
     assert dict(config.task_parameters) == {"gain": 0.01}
     assert SkillConfig.from_json(config.to_json()).to_json() == config.to_json()
 
@@ -115,14 +195,19 @@ def test_a_skill_says_where_it_came_from(trained, dataset):
         np.zeros((0, 8, 3), np.uint8),
     ],
 )
-def test_anything_but_a_picture_is_refused(trained, rgb):
-    with pytest.raises(InvalidInput, match=r"rgb: expected uint8 of shape \(H, W, 3\), got"):
-        load_skill(trained[0]).act(rgb, 0.0)
+def test_anything_but_an_image_is_refused(trained, rgb):
+    with pytest.raises(InvalidInput, match=r"image of camera 'wrist': expected uint8 of shape \("):
+        load_skill(trained[0]).act({"wrist": rgb}, 0.0)
+
+
+def test_a_missing_cameras_image_is_refused(trained):
+    with pytest.raises(InvalidInput, match="expected one of camera 'wrist', got overview"):
+        load_skill(trained[0]).act({"overview": np.zeros((8, 8, 3), np.uint8)}, 0.0)
 
 
 def test_a_gripper_that_is_not_a_number_is_refused(trained):
     with pytest.raises(InvalidInput, match=r"gripper: expected a number in \[0, 1\], got nan"):
-        load_skill(trained[0]).act(np.zeros((8, 8, 3), np.uint8), float("nan"))
+        load_skill(trained[0]).act({"wrist": np.zeros((8, 8, 3), np.uint8)}, float("nan"))
 
 
 def test_a_skill_is_not_overwritten_unless_asked(trained, dataset):
@@ -133,11 +218,11 @@ def test_a_skill_is_not_overwritten_unless_asked(trained, dataset):
     load_skill(path)
 
 
-def test_saving_a_skill_ends_its_checkpoint(dataset, small_config, tmp_path):
+def test_saving_a_skill_ends_its_checkpoint_and_frames(dataset, small_config, tmp_path):
     result = train(dataset, small_config, tmp_path)
-    assert (tmp_path / CHECKPOINT).exists()
+    assert (tmp_path / CHECKPOINT).exists() and (tmp_path / FRAMES).exists()
     save_skill(tmp_path, result, dataset)
-    assert not (tmp_path / CHECKPOINT).exists()
+    assert not (tmp_path / CHECKPOINT).exists() and not (tmp_path / FRAMES).exists()
 
 
 def test_a_missing_directory_is_refused(tmp_path):
@@ -169,8 +254,10 @@ def test_a_truncated_file_is_refused(trained, name):
     [
         ({"robot": None}, "skill configuration: 'robot' is missing"),
         ({"colour": "red"}, "skill configuration: 'colour' is unknown"),
-        ({"recorded_size": [0, 5]}, "recorded_size: expected"),
-        ({"intrinsics": [[1]]}, "intrinsics: expected shape"),
+        ({"cameras": {}}, "cameras: expected wrist as in training, got none"),
+        ({"cameras": {"wrist": {"size": [4, 5]}}}, "camera 'wrist' .* 'T_tool_camera' is missing"),
+        ({"cameras": 3}, "cameras: expected values by name, got 3"),
+        ({"cameras": {"wrist": 3}}, "camera 'wrist' .*: expected values by name, got 3"),
         ({"training": {"policy": "compact_mpl"}}, "training options: 'epochs' is missing"),
         ({"training": 3}, "config.json"),
     ],
@@ -181,12 +268,19 @@ def test_a_configuration_that_makes_no_sense_is_refused(trained, change, message
         load_skill(trained[0])
 
 
-def test_a_configuration_is_checked_when_made(trained):
-    config = load_skill(trained[0]).config
-    with pytest.raises(InvalidInput, match=r"recorded_size: expected \(height, width\)"):
-        dataclasses.replace(config, recorded_size=(32,))
-    with pytest.raises(InvalidInput, match="T_tool_camera: not a rigid transform"):
-        dataclasses.replace(config, T_tool_camera=2 * np.eye(4))
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"size": (32,)}, r"size: expected \(height, width\) \[pixels\], got \(32,\)"),
+        ({"size": (0, 5)}, r"size: expected \(height, width\) \[pixels\], got \(0, 5\)"),
+        ({"intrinsics": [[1]]}, "intrinsics: expected shape"),
+        ({"T_tool_camera": 2 * np.eye(4)}, "T_tool_camera: not a rigid transform"),
+    ],
+)
+def test_a_camera_is_checked_when_made(trained, change, message):
+    camera = load_skill(trained[0]).config.cameras["wrist"]
+    with pytest.raises(InvalidInput, match=message):
+        dataclasses.replace(camera, **change)
 
 
 @pytest.mark.parametrize("name", ["demo.h5", "annotation.json", "model.safetensors"])

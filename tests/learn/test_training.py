@@ -1,8 +1,10 @@
 import dataclasses
+import json
 import os
 import signal
 import threading
 
+import numpy as np
 import pytest
 import torch
 
@@ -10,7 +12,6 @@ from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, SartError, 
 from sart_toolkit.learn import training
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.learn.policies.resnet18_mlp import ResNet18
-from sart_toolkit.learn.samples import build_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.training import (
     CHECKPOINT,
@@ -44,15 +45,18 @@ def _press_ctrl_c_after(step, presses=1):
 # --- learning -----------------------------------------------------------------------------------
 
 
-def test_it_learns_where_the_blob_is_and_transfers_to_pictures_never_seen(make_dataset, tmp_path):
+def test_it_learns_where_the_blob_is_and_transfers_to_images_never_seen(
+    make_dataset, open_windows, tmp_path
+):
     config = TrainConfig.for_policy(
         "compact_mlp", epochs=20, batch_size=32, image_size=32, threads=1, device="cpu"
     )
     result = train(make_dataset((35,) * 8, n=40, segment=40, seed=1), config, tmp_path)
-    held_out = build_windows(make_dataset((35,) * 3, n=40, segment=40, seed=2), "wrist", 32, 2)
-    frames, gripper, actions = held_out.batch(torch.arange(len(held_out.history)))
+    held_out = open_windows(make_dataset((35,) * 3, n=40, segment=40, seed=2), 32)
+    batch = held_out.batch(torch.arange(len(held_out.history)))
     with torch.inference_mode():
-        predicted = result.policy(frames, gripper)
+        predicted = result.policy.predict(batch)
+    actions = batch["action"]
     # The last action of a trajectory holds still whatever the picture shows.
     moving = actions[:, :2].abs().sum(1) > 0
     error = (predicted - actions)[moving, :2].square().mean()
@@ -75,6 +79,29 @@ def test_every_policy_lowers_its_loss(policy, make_dataset, tmp_path):
     result = train(make_dataset((7,), segment=8), config, tmp_path)
     assert result.final_loss < 0.8 * result.curve[0].loss
     assert not result.policy.training
+
+
+def test_what_only_the_second_camera_shows_is_learned(make_dataset, with_steps, tmp_path):
+    def behind_the_wrist(steps):
+        seen = steps.cameras["wrist"]
+        dark = dataclasses.replace(seen, rgb=np.zeros_like(seen.rgb))
+        return dataclasses.replace(steps, cameras={"wrist": dark, "overview": seen})
+
+    dataset = with_steps(make_dataset((20,) * 4, n=30, segment=30, seed=1), behind_the_wrist)
+    options = {"epochs": 12, "batch_size": 32, "image_size": 32, "threads": 1, "device": "cpu"}
+    final = {}
+    for cameras in (("wrist",), ("wrist", "overview")):
+        config = TrainConfig.for_policy("compact_mlp", cameras=cameras, **options)
+        final[len(cameras)] = train(dataset, config, tmp_path / str(len(cameras))).final_loss
+    assert final[2] < 0.7 * final[1]
+
+
+def test_every_trajectory_is_read_once_and_told(dataset, small_config, tmp_path):
+    read = []
+    train(dataset, small_config, tmp_path, reading=lambda *n: read.append(n))
+    assert read == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    train(dataset, small_config, tmp_path, reading=lambda *n: read.append(n))
+    assert len(read) == 4
 
 
 # --- same bits ----------------------------------------------------------------------------------
@@ -116,7 +143,7 @@ def test_an_interrupted_training_ends_with_the_same_bits(
     assert _same_weights(whole, resumed) and _losses(whole) == _losses(resumed)
 
 
-def test_a_training_that_was_killed_goes_on_from_its_last_checkpoint(
+def test_a_training_that_was_killed_resumes_from_its_last_checkpoint(
     dataset, small_config, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(training, "_CHECKPOINT_SECONDS", 0.0)
@@ -136,11 +163,11 @@ def test_a_finished_training_is_not_repeated_unless_asked(dataset, small_config,
     steps = []
     again = train(dataset, small_config, tmp_path, progress=lambda *args: steps.append(args))
     assert not steps and _same_weights(first, again) and first.curve == again.curve
-    anew = train(
+    over = train(
         dataset, small_config, tmp_path, progress=lambda *args: steps.append(args), resume=False
     )
     assert len(steps) == 15 and steps[-1][:2] == (15, 15) and "epoch 3/3" in steps[-1][2]
-    assert _same_weights(first, anew)
+    assert _same_weights(first, over)
 
 
 def test_settings_of_the_process_are_put_back(dataset, small_config, tmp_path):
@@ -174,8 +201,10 @@ def test_it_trains_in_a_thread_that_can_not_take_signals(dataset, small_config, 
 
 
 def test_options_survive_json():
-    config = TrainConfig.for_policy("resnet18_mlp", norm="group", seed=3, threads=2)
-    assert TrainConfig.from_json(config.to_json()) == config
+    config = TrainConfig.for_policy(
+        "resnet18_mlp", norm="group", seed=3, threads=2, cameras=("wrist", "overview")
+    )
+    assert TrainConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
 
 
 def test_resnet18_starts_from_the_papers_table():
@@ -202,6 +231,8 @@ def test_resnet18_starts_from_the_papers_table():
         ("schedule", "linear", "schedule: expected cosine or constant .* got 'linear'"),
         ("bfloat16", "yes", "bfloat16: expected auto or on or off"),
         ("device", "tpu", "device: expected auto or cpu or cuda"),
+        ("cameras", (), r"cameras: expected different names, at least one, got \(\)"),
+        ("cameras", ["a", "a"], r"cameras: expected different names, .* got \('a', 'a'\)"),
         ("norm", "batch", "norm: expected none with policy compact_mlp, got 'batch'"),
     ],
 )
@@ -252,6 +283,19 @@ def test_cuda_is_refused_where_there_is_none(monkeypatch):
         resolve_device("cuda")
 
 
+@pytest.mark.parametrize(
+    ("device", "free", "expected"),
+    [("cuda", 2.1, True), ("cuda", 1.9, False), ("cpu", 100, False)],
+)
+def test_a_gpu_holds_the_images_if_half_of_it_does(
+    dataset, open_windows, monkeypatch, device, free, expected
+):
+    windows = open_windows(dataset)
+    n_bytes = windows.frames.images["wrist"].nbytes
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free * n_bytes, 1e12))
+    assert training._has_room(torch.device(device), windows) is expected
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("policy", sorted(POLICIES))
@@ -282,7 +326,7 @@ def test_a_checkpoint_of_other_options_is_refused(dataset, small_config, tmp_pat
         train(dataset, dataclasses.replace(small_config, **change), tmp_path)
 
 
-def test_a_checkpoint_may_go_on_with_other_threads(dataset, small_config, tmp_path):
+def test_a_checkpoint_may_resume_with_other_threads(dataset, small_config, tmp_path):
     before = train(dataset, small_config, tmp_path)
     after = train(dataset, dataclasses.replace(small_config, threads=2), tmp_path)
     assert after.curve == before.curve
@@ -330,5 +374,5 @@ def test_training_starts_from_backbone_weights(dataset, tmp_path):
     )
     result = train(dataset, config, tmp_path / "out")
     assert torch.allclose(
-        result.policy.state_dict()["encoder.resnet.bn1.weight"], state["bn1.weight"], atol=1e-3
+        result.policy.state_dict()["encoders.0.resnet.bn1.weight"], state["bn1.weight"], atol=1e-3
     )

@@ -32,6 +32,21 @@ def test_the_training_benchmark_ends_with_one_json_object(capsys):
     assert "compact_mlp step" in err and len(out.splitlines()) == 1
 
 
+def test_the_training_data_benchmark_compares_a_file_with_a_copy(capsys):
+    arguments = "training-data --episodes 3 --blocks 2 --steps 1 --image-size 16 --threads 1"
+    assert bench.main(arguments.split()) == 0
+    out, err = capsys.readouterr()
+    figures = json.loads(out.splitlines()[-1])["figures"]
+    assert (figures["episodes"], figures["images"]) == (3, 60 + 3 * 20)
+    assert figures["file_gb"] == pytest.approx(figures["images"] * 20 * 20 * 3 / 1e9)
+    memory = figures["peak_memory_gb"]
+    assert 0 < memory["anonymous"] < memory["total"]
+    assert all(value > 0 for value in figures["images_per_second"].values())
+    low, high = figures["file_over_copy_range"]
+    assert low <= figures["file_over_copy"] <= high
+    assert "read 4/4" in err and "block 2/2" in err
+
+
 def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
     arguments = "augment --n 2 --image-size 16 --repeats 1"
     assert bench.main(arguments.split()) == 0
@@ -63,6 +78,7 @@ def test_the_certificate_benchmark_counts_verdicts_and_what_they_miss(capsys):
         (["trian"], "unknown benchmark 'trian': did you mean 'train'"),
         (["train", "--policy", "compact"], "unknown policy 'compact': did you mean 'compact_mlp'"),
         (["train", "--blocks", "0"], "--blocks: expected a finite number > 0"),
+        (["training-data", "--steps", "0"], "--steps: expected a finite number > 0"),
         (["train", "--seconds", "nan"], "--seconds: expected a finite number > 0"),
     ],
 )

@@ -1,11 +1,10 @@
-"""What a policy brings: an encoder of pictures and the training options that suit it."""
+"""Encoders of images, which the policies of `mlp.py` put under their head."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from safetensors.torch import load_file
@@ -15,35 +14,23 @@ from sart_toolkit.errors import BrokenFile, InvalidInput, MissingFile
 
 
 class Encoder(nn.Module, ABC):
-    """Features `(n, feature_size)` from normalised pictures `(n, 3, image_size, image_size)`.
+    """Features `(n, feature_size)` from normalised images `(n, 3, *image_size)`.
 
-    A subclass is built from `(image_size, norm)`, where `norm` is one of its `norms`, and sets
-    `feature_size`. Pictures reach it as (value - image_mean) / image_std, per channel, of values
-    in 0..255. `train_defaults` are the options of `TrainConfig` that suit it on a CPU.
+    A subclass is built from `(image_size, norm)`, where `image_size` is `(height, width)` [pixels]
+    and `norm` names its normalisation layers, and sets `feature_size`. Images reach it as
+    (value - image_mean) / image_std, per channel, of values in 0..255.
     """
 
-    norms: ClassVar[tuple[str, ...]]
-    train_defaults: ClassVar[Mapping[str, Any]]
     image_mean: ClassVar[tuple[float, float, float]] = (127.5, 127.5, 127.5)
     image_std: ClassVar[tuple[float, float, float]] = (127.5, 127.5, 127.5)
     feature_size: int
 
     @abstractmethod
-    def __init__(self, image_size: int, norm: str) -> None:
+    def __init__(self, image_size: tuple[int, int], norm: str) -> None:
         super().__init__()
 
     @abstractmethod
-    def forward(self, pictures: Tensor) -> Tensor: ...
-
-    def load_backbone(self, path: Path) -> None:
-        """Start from the weights in a file.
-
-        Raises:
-            InvalidInput: this encoder has no published weights to start from.
-        """
-        raise InvalidInput(
-            f"{type(self).__name__} takes no --backbone-weights; leave it out, or use resnet18_mlp"
-        )
+    def forward(self, images: Tensor) -> Tensor: ...
 
 
 def read_state_dict(path: Path) -> dict[str, Tensor]:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from sart_toolkit.errors import Mismatch
 from sart_toolkit.learn.policies.encoder import Encoder, read_state_dict
+from sart_toolkit.learn.policies.mlp import MLPPolicy
 
 _GROUP_WIDTH = 16
 
@@ -77,6 +78,24 @@ class ResNet18(nn.Module):
 class ResNet18Encoder(Encoder):
     """The 512 pooled features of a ResNet18, all of it trained."""
 
+    # ImageNet's statistics, which published weights expect.
+    image_mean: ClassVar[tuple[float, float, float]] = (123.675, 116.28, 103.53)
+    image_std: ClassVar[tuple[float, float, float]] = (58.395, 57.12, 57.375)
+
+    def __init__(self, image_size: tuple[int, int], norm: str) -> None:
+        super().__init__(image_size, norm)
+        self.resnet = ResNet18(norm)
+        self.resnet.fc = nn.Identity()
+        self.feature_size = 512
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.resnet(images)
+
+
+class ResNet18MLP(MLPPolicy):
+    """The paper's policy."""
+
+    encoder: ClassVar[type[Encoder]] = ResNet18Encoder
     norms: ClassVar[tuple[str, ...]] = tuple(_NORMS)
     train_defaults: ClassVar[Mapping[str, Any]] = {
         "epochs": 40,
@@ -88,21 +107,9 @@ class ResNet18Encoder(Encoder):
         "image_shift": 0,
         "norm": "batch",
     }
-    # ImageNet's statistics, which published weights expect.
-    image_mean: ClassVar[tuple[float, float, float]] = (123.675, 116.28, 103.53)
-    image_std: ClassVar[tuple[float, float, float]] = (58.395, 57.12, 57.375)
-
-    def __init__(self, image_size: int, norm: str) -> None:
-        super().__init__(image_size, norm)
-        self.resnet = ResNet18(norm)
-        self.resnet.fc = nn.Identity()
-        self.feature_size = 512
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        return self.resnet(pictures)
 
     def load_backbone(self, path: Path) -> None:
-        """Start from a ResNet18 state dict with torchvision's names; its `fc` is not used.
+        """Start every camera from a ResNet18 state dict with torchvision's names, without its `fc`.
 
         Raises:
             MissingFile: no such file.
@@ -110,8 +117,9 @@ class ResNet18Encoder(Encoder):
             BrokenFile: unreadable, or it holds anything but tensors by name.
             Mismatch: names or shapes differ from this ResNet18's.
         """
+        resnets = [encoder.get_submodule("resnet") for encoder in self.encoders]
         given = {k: v for k, v in read_state_dict(path).items() if not k.startswith("fc.")}
-        expected = self.resnet.state_dict()
+        expected = resnets[0].state_dict()
         for problem, names in (
             ("lacks", sorted(expected.keys() - given.keys())),
             ("also holds", sorted(given.keys() - expected.keys())),
@@ -127,7 +135,8 @@ class ResNet18Encoder(Encoder):
                     f"{path}: {name!r} has shape {tuple(given[name].shape)}, ResNet18 needs "
                     f"{tuple(tensor.shape)}; pass weights of a ResNet18"
                 )
-        self.resnet.load_state_dict(given)
+        for resnet in resnets:
+            resnet.load_state_dict(given)
 
 
 def _and_more(names: list[str]) -> str:
