@@ -17,7 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sart_toolkit.data.records import CameraRecord, Dataset, Image, Steps, digest
+from sart_toolkit.data.dataset import Dataset
+from sart_toolkit.data.records import CameraRecord, Image, Steps, digest
 from sart_toolkit.errors import InvalidInput, Mismatch, unknown_name
 from sart_toolkit.poses import Array
 
@@ -176,20 +177,17 @@ def build_windows(dataset: Dataset, camera: str, image_size: int, history: int) 
     for name, value in (("image_size", image_size), ("history", history)):
         if value < 1:
             raise InvalidInput(f"{name}: expected at least 1, got {value}")
-    demonstration = dataset.demonstration
+    demonstration = dataset.sources[0].demonstration
     if camera not in demonstration.steps.cameras:
         raise unknown_name("camera", camera, demonstration.steps.cameras)
     reference = demonstration.steps.cameras[camera]
-    demonstration_hash = demonstration.content_hash()
 
     recordings: list[Steps] = [demonstration.steps]
     sequences = [np.arange(len(demonstration))]
     actions = [demonstration.actions]
     n_frames = len(demonstration)
-    for i, episode in enumerate(dataset.episodes):
+    for i, episode in enumerate(dataset):
         t_star = episode.provenance.t_star
-        if episode.provenance.demonstration_hash != demonstration_hash:
-            raise Mismatch(f"episode {i} was generated from another demonstration; generate again")
         if not 0 <= t_star < len(demonstration):
             raise Mismatch(
                 f"episode {i} rejoins at step {t_star} of a demonstration of "

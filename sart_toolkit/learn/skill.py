@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from sart_toolkit.data import storage
+from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     Annotation,
-    Dataset,
     Demonstration,
     Image,
     library_versions,
@@ -189,7 +189,8 @@ def save_skill(
     path = Path(path)
     storage.check_writable(path / "config.json", overwrite)
     storage.remove(path / "config.json")
-    demonstration = dataset.demonstration
+    source = dataset.sources[0]
+    demonstration = source.demonstration
     camera = demonstration.steps.cameras[result.config.camera]
     config = SkillConfig(
         task=demonstration.task,
@@ -204,7 +205,7 @@ def save_skill(
         training=result.config,
     )
     storage.save_demonstration(path / "demo.h5", demonstration)
-    storage.save_annotation(path / "annotation.json", dataset.annotation)
+    storage.save_annotation(path / "annotation.json", source.annotation)
     storage.write_json(
         path / "training.json",
         {
@@ -213,7 +214,7 @@ def save_skill(
             "seconds": result.seconds,
             "images_per_second": result.images_per_second,
             "windows": result.n_windows,
-            "trajectories": 1 + len(dataset.episodes),
+            "trajectories": len(dataset.sources) + len(dataset),
             "device": result.device,
             "bfloat16": result.bfloat16,
             "config": result.config.to_json(),

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.storage import (
     load_annotation,
-    load_dataset,
     load_demonstration,
     read_json,
     write_text,
@@ -89,7 +89,7 @@ def _load_run(directory: Path) -> _Run:
         demonstration=optional("demo.h5", load_demonstration),
         annotation=optional("annotation.json", load_annotation),
         augmentation=dataset.info if dataset is not None else None,
-        paths=segment_paths(dataset.episodes) if dataset is not None else (),
+        paths=segment_paths(dataset) if dataset is not None else (),
         training=optional("skill/training.json", read_json),
         evaluation=optional("evaluation.json", read_json),
         run=optional("run.json", read_json),

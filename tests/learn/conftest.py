@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     Annotation,
     CameraRecord,
-    Dataset,
     Demonstration,
     Episode,
     PrecisionSphere,
     Provenance,
     Steps,
 )
+from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.learn.training import TrainConfig
 from sart_toolkit.poses import pose
 
@@ -64,7 +66,7 @@ def make_steps(
 
 
 def make_dataset(
-    t_stars: tuple[int, ...] = (3, 5, 5), n: int = 9, segment: int = 4, seed: int = 0
+    path: Path, t_stars: tuple[int, ...] = (3, 5, 5), n: int = 9, segment: int = 4, seed: int = 0
 ) -> Dataset:
     """A demonstration of `n` steps and an episode that rejoins it at each of `t_stars`."""
     rng = np.random.default_rng(seed)
@@ -89,11 +91,11 @@ def make_dataset(
     episodes = tuple(
         Episode(
             make_steps(segment, rng, demonstration.steps.commanded_Ts_world_tool[t_star]),
-            Provenance(demonstration.content_hash(), 0, k, t_star, key, seed, "sart", "paper"),
+            Provenance(demonstration.content_hash(), 0, 0, k, t_star, key, seed, "sart", "paper"),
         )
         for k, t_star in enumerate(t_stars)
     )
-    return Dataset(demonstration, annotation, episodes)
+    return write_dataset(path, [(demonstration, annotation)], episodes, {})
 
 
 def perturbed(steps: Steps) -> Steps:
@@ -108,10 +110,11 @@ def perturbed(steps: Steps) -> Steps:
     )
 
 
-def with_steps(dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
+def with_steps(path: Path, dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
     """The dataset with all steps changed, and hashes that match again."""
+    (source,) = dataset.sources
     demonstration = dataclasses.replace(
-        dataset.demonstration, steps=change(dataset.demonstration.steps)
+        source.demonstration, steps=change(source.demonstration.steps)
     )
     sha = demonstration.content_hash()
     episodes = tuple(
@@ -119,14 +122,18 @@ def with_steps(dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
             change(episode.steps),
             dataclasses.replace(episode.provenance, demonstration_hash=sha),
         )
-        for episode in dataset.episodes
+        for episode in dataset
     )
-    return Dataset(demonstration, dataset.annotation, episodes)
+    key = demonstration.steps.measured_Ts_world_tool[0]
+    annotation = Annotation((PrecisionSphere(0, key, 0.05),), sha)
+    return write_dataset(path, [(demonstration, annotation)], episodes, {})
 
 
 @pytest.fixture(name="make_dataset")
-def _make_dataset() -> Callable[..., Dataset]:
-    return make_dataset
+def _make_dataset(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Dataset]:
+    return lambda *args, **options: make_dataset(
+        tmp_path_factory.mktemp("dataset"), *args, **options
+    )
 
 
 @pytest.fixture(name="perturbed")
@@ -135,13 +142,16 @@ def _perturbed() -> Callable[[Steps], Steps]:
 
 
 @pytest.fixture(name="with_steps")
-def _with_steps() -> Callable[[Dataset, Callable[[Steps], Steps]], Dataset]:
-    return with_steps
+def _with_steps(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[Dataset, Callable[[Steps], Steps]], Dataset]:
+    return lambda dataset, change: with_steps(tmp_path_factory.mktemp("dataset"), dataset, change)
 
 
 @pytest.fixture
-def dataset() -> Dataset:
-    return make_dataset()
+def dataset(make_dataset: Callable[..., Dataset]) -> Dataset:
+    made: Dataset = make_dataset()
+    return made
 
 
 @pytest.fixture

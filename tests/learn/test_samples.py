@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from sart_toolkit.data.records import Dataset
+from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import InvalidInput, Mismatch, UnknownName
 from sart_toolkit.learn.samples import build_windows, resize_area
 from sart_toolkit.poses import pose
@@ -13,11 +13,9 @@ from sart_toolkit.poses import pose
 
 def _expected_windows(dataset, history):
     """Every window of every trajectory, one by one: frames, gripper and action as bytes."""
-    demonstration = dataset.demonstration
+    demonstration = dataset.sources[0].demonstration
     trajectories = [(demonstration.steps, len(demonstration), demonstration.actions)]
-    trajectories += [
-        (e.steps, e.provenance.t_star, e.actions(demonstration)) for e in dataset.episodes
-    ]
+    trajectories += [(e.steps, e.provenance.t_star, e.actions(demonstration)) for e in dataset]
     windows = Counter()
     for steps, t_star, actions in trajectories:
         frames = list(steps.cameras["wrist"].rgb)
@@ -51,7 +49,7 @@ def test_windows_are_exactly_the_steps_of_all_trajectories(make_dataset, history
 def test_each_picture_is_stored_once(make_dataset):
     dataset = make_dataset((2,) * 20)
     windows = build_windows(dataset, "wrist", 16, 2)
-    assert len(windows.frames) == len(dataset.demonstration) + 20 * 4
+    assert len(windows.frames) == len(dataset.sources[0].demonstration) + 20 * 4
 
 
 def test_the_first_window_repeats_the_first_frame(dataset):
@@ -163,36 +161,40 @@ def test_an_unknown_camera_is_refused_with_the_nearest(dataset):
         build_windows(dataset, "wirst", 16, 2)
 
 
-def _with_last(dataset, steps=None, **provenance):
-    last = dataset.episodes[-1]
+def _with_last(path, dataset, steps=None, **provenance):
+    *others, last = dataset
     changed = dataclasses.replace(
         last,
         steps=steps or last.steps,
         provenance=dataclasses.replace(last.provenance, **provenance),
     )
-    return Dataset(dataset.demonstration, dataset.annotation, (*dataset.episodes[:-1], changed))
+    (source,) = dataset.sources
+    sources = [(source.demonstration, source.annotation)]
+    return write_dataset(path, sources, [*others, changed], {})
 
 
-def test_an_episode_of_another_demonstration_is_refused(dataset):
-    with pytest.raises(Mismatch, match="episode 2 was generated from another demonstration"):
-        build_windows(_with_last(dataset, demonstration_hash="0"), "wrist", 16, 2)
+def test_an_episode_of_another_demonstration_is_refused(dataset, tmp_path):
+    with pytest.raises(
+        Mismatch, match="sphere00_k00002.h5 was generated from another demonstration"
+    ):
+        build_windows(_with_last(tmp_path, dataset, demonstration_hash="0"), "wrist", 16, 2)
 
 
 @pytest.mark.parametrize("t_star", [-1, 9])
-def test_an_episode_that_rejoins_nowhere_is_refused(dataset, t_star):
+def test_an_episode_that_rejoins_nowhere_is_refused(dataset, tmp_path, t_star):
     with pytest.raises(Mismatch, match=f"episode 2 rejoins at step {t_star} of a demonstration"):
-        build_windows(_with_last(dataset, t_star=t_star), "wrist", 16, 2)
+        build_windows(_with_last(tmp_path, dataset, t_star=t_star), "wrist", 16, 2)
 
 
-def test_an_episode_without_the_camera_is_refused(dataset):
-    steps = dataclasses.replace(dataset.episodes[-1].steps, cameras={})
+def test_an_episode_without_the_camera_is_refused(dataset, tmp_path):
+    steps = dataclasses.replace(dataset.episode(2).steps, cameras={})
     with pytest.raises(Mismatch, match="episode 2 has no pictures of camera 'wrist'"):
-        build_windows(_with_last(dataset, steps), "wrist", 16, 2)
+        build_windows(_with_last(tmp_path, dataset, steps), "wrist", 16, 2)
 
 
 @pytest.mark.parametrize("field", ["intrinsics", "T_tool_camera", "size"])
-def test_an_episode_seen_by_another_camera_is_refused(dataset, field):
-    steps = dataset.episodes[-1].steps
+def test_an_episode_seen_by_another_camera_is_refused(dataset, tmp_path, field):
+    steps = dataset.episode(2).steps
     camera = steps.cameras["wrist"]
     if field == "size":
         camera = dataclasses.replace(camera, rgb=camera.rgb[:, 2:], depth=camera.depth[:, 2:])
@@ -202,4 +204,4 @@ def test_an_episode_seen_by_another_camera_is_refused(dataset, field):
         camera = dataclasses.replace(camera, **{field: value})
     steps = dataclasses.replace(steps, cameras={"wrist": camera})
     with pytest.raises(Mismatch, match="episode 2: camera 'wrist' has another size, intrinsics or"):
-        build_windows(_with_last(dataset, steps), "wrist", 16, 2)
+        build_windows(_with_last(tmp_path, dataset, steps), "wrist", 16, 2)

@@ -49,7 +49,7 @@ def test_a_skill_acts_as_the_policy_did_in_training(trained, dataset):
     path, result = trained
     skill = load_skill(path)
     windows = build_windows(dataset, "wrist", 16, 2)
-    steps = dataset.demonstration.steps
+    steps = dataset.sources[0].demonstration.steps
     for _ in range(2):
         skill.reset()
         for t in range(len(steps)):
@@ -66,7 +66,7 @@ def test_a_skill_acts_as_the_policy_did_in_training(trained, dataset):
 
 @pytest.mark.parametrize("few", [True, False])
 def test_the_gripper_is_told_what_was_shown_unless_that_was_much(trained, dataset, few):
-    demonstration = dataset.demonstration
+    demonstration = dataset.sources[0].demonstration
     shown = np.linspace(0, 0.8, 3 if few else len(demonstration.steps))
     commands = np.resize(shown, len(demonstration.steps))
     steps = dataclasses.replace(demonstration.steps, commanded_gripper=commands)
@@ -96,8 +96,8 @@ def test_a_skill_takes_pictures_of_any_size(trained):
 
 def test_a_skill_says_where_it_came_from(trained, dataset):
     skill = load_skill(trained[0])
-    assert skill.demonstration.content_hash() == dataset.demonstration.content_hash()
-    assert skill.annotation.demonstration_hash == dataset.annotation.demonstration_hash
+    assert skill.demonstration.content_hash() == dataset.sources[0].demonstration.content_hash()
+    assert skill.annotation.demonstration_hash == dataset.sources[0].annotation.demonstration_hash
     config = skill.config
     assert (config.task, config.robot, config.backend) == ("blob", "none", "synthetic")
     assert (config.camera, config.recorded_size) == ("wrist", (32, 32))
