@@ -276,7 +276,9 @@ def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
     """Where two JSON values differ, with what each has there."""
     if isinstance(found, dict) and isinstance(wanted, dict):
         pairs = {key: (found.get(key), wanted.get(key)) for key in found | wanted}
-    elif isinstance(found, list) and isinstance(wanted, list) and len(found) == len(wanted):
+    elif isinstance(found, list) and isinstance(wanted, list):
+        if len(found) != len(wanted):
+            return [f"{len(found)} {name}, now {len(wanted)}"]
         pairs = {str(i): pair for i, pair in enumerate(zip(found, wanted, strict=True))}
     else:
         return [] if found == wanted else [f"{name} {_short(found)}, now {_short(wanted)}"]

@@ -14,6 +14,7 @@ import pytest
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import Attempt, RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
+from sart_toolkit.benchmark import segments
 from sart_toolkit.benchmark.operator import Cell
 from sart_toolkit.benchmark.segments import (
     SegmentsConfig,
@@ -25,7 +26,6 @@ from sart_toolkit.cli import main
 from sart_toolkit.data.manifest import AttemptKey
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
-from sart_toolkit.evaluate import segments
 from sart_toolkit.motion import timing
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array
