@@ -11,7 +11,9 @@ import dataclasses
 import functools
 import importlib.metadata
 import json
+import os
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -21,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from sart_toolkit import doctor
 from sart_toolkit.annotate.session import AnnotationSession
@@ -28,16 +31,16 @@ from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.backends.interface import Backend
+from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.cloud import fuse_cloud
 from sart_toolkit.collision.demonstrated import DemonstratedScene
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
+from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     CONTROL_HZ,
     Annotation,
     CameraRecord,
-    Dataset,
     Demonstration,
     Episode,
     PrecisionSphere,
@@ -46,6 +49,7 @@ from sart_toolkit.data.records import (
     library_versions,
 )
 from sart_toolkit.data.storage import load_demonstration, save_demonstration
+from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import InvalidInput, MotionRejected, SartError, Unreachable, unknown_name
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.learn.samples import Batch, build_windows
@@ -116,7 +120,9 @@ def bench_train(arguments: Sequence[str]) -> dict[str, Any]:
 
 def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[str, Any]:
     device = resolve_device(config.device)
-    windows = build_windows(_synthetic_dataset(2), config.camera, config.image_size, config.history)
+    with tempfile.TemporaryDirectory() as scratch:
+        few = _synthetic_dataset(Path(scratch), 2)
+        windows = build_windows(few, config.camera, config.image_size, config.history)
     first = torch.arange(config.batch_size) % len(windows.history)
     bare_step = _bare_stepper(config, windows.to(device).batch(first))
     # The first steps choose and compile kernels.
@@ -126,14 +132,13 @@ def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[s
     # At most 39 generated trajectories, and two epochs at least so that an epoch's end is counted.
     per_trajectory = _DEMONSTRATION_STEPS // 2 + _SEGMENT_STEPS
     n_episodes = min(39, max(2, n_steps * config.batch_size // (2 * per_trajectory)))
-    dataset = _synthetic_dataset(n_episodes)
     n_windows = _DEMONSTRATION_STEPS + n_episodes * per_trajectory
     n_batches = -(-n_windows // config.batch_size)
     config = dataclasses.replace(config, epochs=-(-n_steps // n_batches))
 
     loop_seconds: list[float] = []
     bare_seconds: list[float] = []
-    last = time.perf_counter()
+    last = 0.0
 
     def between_steps(done: int, total: int, text: str) -> None:
         nonlocal last
@@ -145,7 +150,9 @@ def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[s
         last = time.perf_counter()
 
     with tempfile.TemporaryDirectory() as scratch:
-        result = train(dataset, config, Path(scratch), progress=between_steps)
+        dataset = _synthetic_dataset(Path(scratch) / "dataset", n_episodes)
+        last = time.perf_counter()
+        result = train(dataset, config, Path(scratch) / "skill", progress=between_steps)
     # The first block warms up.
     blocks = [slice(i * per_block, (i + 1) * per_block) for i in range(1, n_blocks + 1)]
     loop_images = n_windows / n_batches * config.history * per_block
@@ -195,15 +202,27 @@ def _synchronise(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def _synthetic_dataset(n_episodes: int) -> Dataset:
-    """A dataset of random 128x128 pictures, shaped as augmentation makes them."""
+def _synthetic_dataset(path: Path, n_episodes: int, flat: bool = False) -> Dataset:
+    """A dataset of 128x128 pictures, shaped as augmentation makes them.
+
+    The pictures are noise, or `flat`: a plain one with a box in it, as easy to compress as any.
+    """
     rng = np.random.default_rng(0)
+
+    def pictures(n: int) -> NDArray[np.uint8]:
+        if not flat:
+            return rng.integers(0, 256, (n, 128, 128, 3), dtype=np.uint8)
+        plain = np.empty((n, 128, 128, 3), np.uint8)
+        plain[:] = rng.integers(0, 256, (n, 1, 1, 3), dtype=np.uint8)
+        for picture, (u, v) in zip(plain, rng.integers(0, 96, (n, 2)), strict=True):
+            picture[u : u + 32, v : v + 32] = 255 - picture[0, 0]
+        return plain
 
     def steps(n: int) -> Steps:
         commanded = np.tile(pose((0.4, 0.0, 0.3)), (n, 1, 1))
         commanded[:, :3, 3] += np.cumsum(rng.normal(0, 0.005, (n, 3)), 0)
         camera = CameraRecord(
-            rgb=rng.integers(0, 256, (n, 128, 128, 3), dtype=np.uint8),
+            rgb=pictures(n),
             depth=np.zeros((n, 128, 128), np.float32),
             intrinsics=np.diag([128.0, 128.0, 1.0]),
             T_tool_camera=np.eye(4),
@@ -241,14 +260,104 @@ def _synthetic_dataset(n_episodes: int) -> Dataset:
     )
     sha = demonstration.content_hash()
     key = demonstration.steps.measured_Ts_world_tool[0]
-    episodes = tuple(
+    annotation = Annotation((PrecisionSphere(0, key, 0.1),), sha)
+    episodes = (
         Episode(
             steps(_SEGMENT_STEPS),
-            Provenance(sha, 0, k, n // 2, key, 0, "sart", "paper"),
+            Provenance(sha, 0, 0, k, n // 2, key, 0, "sart", "paper"),
         )
         for k in range(n_episodes)
     )
-    return Dataset(demonstration, Annotation((PrecisionSphere(0, key, 0.1),), sha), episodes)
+    info = {"task": "synthetic", "seconds": 0.0}
+    return write_dataset(path, [(demonstration, annotation)], episodes, info)
+
+
+# --- datasets -----------------------------------------------------------------------------------
+
+_OPEN = """
+from sart_toolkit.data.dataset import load_dataset
+from pathlib import Path
+started = time.perf_counter()
+result = {"episodes": len(load_dataset(Path(sys.argv[1])))}
+"""
+_INFO = """
+from sart_toolkit.cli import main
+main(["info", sys.argv[1], "--json"])
+result = {}
+"""
+_AUGMENT = """
+from pathlib import Path
+from bench import augmentation
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
+demonstration, annotation, make = augmentation(sys.argv[2], int(sys.argv[3]))
+started = time.perf_counter()
+dataset = augment_demonstration(
+    demonstration, annotation, make, Path(sys.argv[1]), AugmentConfig(int(sys.argv[4]))
+)
+result = {"kept": len(dataset)}
+"""
+_MEASURED = """
+import json, sys, time
+started = time.perf_counter()
+{}
+result["seconds"] = time.perf_counter() - started
+status = open("/proc/self/status").read()
+# Of this program alone: what `getrusage` says counts the memory of the one that started it.
+result["peak_mb"] = int(status.split("VmHWM:")[1].split()[0]) / 1024
+print(json.dumps(result))
+"""
+
+
+def bench_dataset(arguments: Sequence[str]) -> dict[str, Any]:
+    """Seconds and peak memory of opening a large dataset and of generating a small and a large one.
+
+    The large dataset is synthetic: 20 steps an episode, 128x128 RGB-D, pictures that are easy to
+    compress. Each figure is of a program of its own. Opening is `load_dataset` after its imports;
+    `info` is the whole command, from its imports on.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py dataset", description=bench_dataset.__doc__)
+    parser.add_argument("--episodes", type=int, default=10_000, help="of the synthetic dataset")
+    parser.add_argument("--n", type=int, nargs="+", default=[40, 400], help="trajectories")
+    parser.add_argument("--task", default="peg_in_hole", help=", ".join(TASKS))
+    parser.add_argument("--image-size", type=int, default=128, help="of augmentation [pixels]")
+    options = parser.parse_args(arguments)
+    check_positive("--episodes", options.episodes)
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "synthetic"
+        started = time.perf_counter()
+        _synthetic_dataset(path, options.episodes, flat=True)
+        making = time.perf_counter() - started
+        _say(f"{options.episodes} episodes made in {making:.0f} s")
+        size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+        figures: dict[str, Any] = {
+            "episodes": options.episodes,
+            "size_mb": size / 2**20,
+            "making_seconds": making,
+            "open": _measured(_OPEN, path),
+            "info": _measured(_INFO, path),
+            "augment": {},
+        }
+        for n in options.n:
+            out = Path(scratch) / str(n)
+            found = _measured(_AUGMENT, out, options.task, options.image_size, n)
+            figures["augment"][str(n)] = found
+            _say(f"augment --n {n}: {found['peak_mb']:.0f} MB, {found['seconds']:.0f} s")
+    return figures
+
+
+def _measured(work: str, *arguments: Any) -> dict[str, Any]:
+    """What a program of its own says of its work, with its seconds and peak memory."""
+    run = subprocess.run(
+        [sys.executable, "-c", _MEASURED.format(work), *map(str, arguments)],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
+        capture_output=True,
+        text=True,
+    )
+    if run.returncode:
+        raise SartError(f"a measured program failed: {run.stderr.strip().splitlines()[-1]}")
+    found: dict[str, Any] = json.loads(run.stdout.splitlines()[-1])
+    return found
 
 
 # --- augmentation -------------------------------------------------------------------------------
@@ -266,15 +375,7 @@ def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args(arguments)
     check_positive("--repeats", options.repeats)
-    task = get_task(options.task)
-    robot = get_robot(task.robot)
-    make = functools.partial(make_backend, "pybullet", robot, task.scene, options.image_size)
-    model = RobotModel(robot, task.scene.held)
-    plan = task.plan(task.initial_state(model, Placement()))
-    operator = ScriptedOperator(plan, np.random.default_rng(0))
-    demonstration = record_demonstration(make(), task, model, operator)
-    scene = DemonstratedScene(demonstration, robot, task.scene)
-    annotation = suggest_annotation(demonstration, ExactSurroundings(scene))
+    demonstration, annotation, make = augmentation(options.task, options.image_size)
     per_second, over_wall = [], []
     with tempfile.TemporaryDirectory() as scratch:
         for turn in range(options.repeats):
@@ -297,6 +398,21 @@ def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
         "processes": 1,
         "repeats": options.repeats,
     }
+
+
+def augmentation(
+    task_name: str, image_size: int
+) -> tuple[Demonstration, Annotation, BackendFactory]:
+    """A demonstration of a task, its suggested spheres, and what makes its robot and scene."""
+    task = get_task(task_name)
+    robot = get_robot(task.robot)
+    make = functools.partial(make_backend, "pybullet", robot, task.scene, image_size)
+    model = RobotModel(robot, task.scene.held)
+    plan = task.plan(task.initial_state(model, Placement()))
+    operator = ScriptedOperator(plan, np.random.default_rng(0))
+    demonstration = record_demonstration(make(), task, model, operator)
+    scene = DemonstratedScene(demonstration, robot, task.scene)
+    return demonstration, suggest_annotation(demonstration, ExactSurroundings(scene)), make
 
 
 # --- certificates -------------------------------------------------------------------------------
@@ -703,6 +819,7 @@ BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "annotate": bench_annotate,
     "augment": bench_augment,
     "certificate": bench_certificate,
+    "dataset": bench_dataset,
     "step": bench_step,
     "train": bench_train,
 }

@@ -16,8 +16,8 @@ from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.data.dataset import Dataset, Source
 from sart_toolkit.data.manifest import AttemptKey, EpisodeEntry, Rejection
 from sart_toolkit.data.records import Annotation, Demonstration
-from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles
-from sart_toolkit.errors import InvalidInput, Mismatch
+from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles, check_sources
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.workers import worker_map
 
 _log = logging.getLogger(__name__)
@@ -110,13 +110,12 @@ def augment_sources(
         OutputExists: `out` holds something else and `overwrite` is false.
         CannotWrite: the disk refuses, or another process is at work on `out`.
         InvalidInput: no attempt from any sphere was kept, `workers` is not positive or more than
-            the executor can use, or there are no fewer demonstrations than trajectories wanted.
+            the executor can use, or there is no demonstration, or not fewer than trajectories
+            wanted.
     """
     config = config or AugmentConfig()
     # All that can be refused is refused before anything is replaced.
-    for demonstration, annotation in sources:
-        annotation.check_matches(demonstration)
-    _check_alike([demonstration for demonstration, _ in sources])
+    check_sources(sources)
     executor = get_executor(config.executor)
     if workers < 1:
         raise InvalidInput(f"workers: expected at least 1, got {workers}")
@@ -155,16 +154,6 @@ def augment_sources(
                     if progress is not None:
                         progress(writer.n_kept, sum(quotas), writer.n_rejected)
         return _finish(writer, sources[0][0], config, sum(quotas), time.perf_counter() - started)
-
-
-def _check_alike(demonstrations: Sequence[Demonstration]) -> None:
-    for what in ("task", "robot"):
-        found = sorted({getattr(demonstration, what) for demonstration in demonstrations})
-        if len(found) > 1:
-            raise Mismatch(
-                f"the demonstrations are of different {what}s ({', '.join(found)}); make a dataset "
-                "of each"
-            )
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:

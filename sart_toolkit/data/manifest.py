@@ -49,7 +49,7 @@ class EpisodeEntry:
     @property
     def name(self) -> str:
         """The episode's file in the dataset directory."""
-        return f"episodes/{source_name(self.source)}/sphere{self.sphere:02d}_k{self.k:05d}.h5"
+        return episode_name(self.key)
 
 
 class Rejection(NamedTuple):
@@ -62,6 +62,11 @@ class Rejection(NamedTuple):
 def source_name(source: int) -> str:
     """The folder of a dataset's demonstration, by its number."""
     return f"demo{source:02d}"
+
+
+def episode_name(key: AttemptKey) -> str:
+    """The file of an attempt's episode in a dataset directory."""
+    return f"episodes/{source_name(key.source)}/sphere{key.sphere:02d}_k{key.k:05d}.h5"
 
 
 @dataclass

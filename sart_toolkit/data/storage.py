@@ -445,19 +445,21 @@ def load_demonstration(path: Path) -> Demonstration:
     return demonstration
 
 
-def save_episode(path: Path, episode: Episode) -> None:
-    """Write one generated episode to an HDF5 file, whole or not at all.
+def save_episode(path: Path, episode: Episode) -> str:
+    """The content hash of one generated episode, written to an HDF5 file whole or not at all.
 
     Raises:
         CannotWrite: the disk refuses.
     """
     provenance = dataclasses.asdict(episode.provenance)
     provenance["T_world_sampled"] = episode.provenance.T_world_sampled.tolist()
+    content_hash = episode.content_hash()
     with _writing(path, "episode") as file:
         _put_steps(file.create_group("steps"), episode.steps)
         file["joint_path"] = episode.joint_path
         file.attrs["provenance"] = json.dumps(provenance)
-        file.attrs["content_hash"] = episode.content_hash()
+        file.attrs["content_hash"] = content_hash
+    return content_hash
 
 
 def load_episode(path: Path, content_hash: str | None = None) -> Episode:

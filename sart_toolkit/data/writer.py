@@ -21,6 +21,7 @@ from sart_toolkit.data.manifest import (
     EpisodeEntry,
     Manifest,
     Rejection,
+    episode_name,
     kept_row,
     rejected_row,
 )
@@ -35,7 +36,28 @@ from sart_toolkit.data.storage import (
     save_episode,
     write_json,
 )
-from sart_toolkit.errors import BrokenFile, InvalidInput, OutputExists, SartError
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, OutputExists, SartError
+
+
+def check_sources(sources: Sequence[tuple[Demonstration, Annotation]]) -> None:
+    """Return if a dataset can be made of demonstrations and their annotations.
+
+    Raises:
+        InvalidInput: there is none.
+        Mismatch: an annotation belongs to another demonstration, or the demonstrations to different
+            tasks or robots.
+    """
+    if not sources:
+        raise InvalidInput("sources: expected at least one demonstration, got none")
+    for demonstration, annotation in sources:
+        annotation.check_matches(demonstration)
+    for what in ("task", "robot"):
+        found = sorted({getattr(demonstration, what) for demonstration, _ in sources})
+        if len(found) > 1:
+            raise Mismatch(
+                f"the demonstrations are of different {what}s ({', '.join(found)}); make a dataset "
+                "of each"
+            )
 
 
 class EpisodeFiles:
@@ -52,11 +74,9 @@ class EpisodeFiles:
         """
         p = episode.provenance
         clearance = p.certificate["commanded"]["clearance"] if p.certificate else None
-        entry = EpisodeEntry(
-            p.source, p.sphere, p.k, len(episode), episode.content_hash(), clearance
-        )
-        save_episode(self._path / entry.name, episode)
-        return entry
+        key = AttemptKey(p.source, p.sphere, p.k)
+        content_hash = save_episode(self._path / episode_name(key), episode)
+        return EpisodeEntry(*key, len(episode), content_hash, clearance)
 
     def hold(self, entry: EpisodeEntry) -> bool:
         """Whether an episode's file is there and whole."""
@@ -97,17 +117,13 @@ class DatasetWriter:
             overwrite: replace a dataset in `path`.
 
         Raises:
-            InvalidInput: no source.
-            Mismatch: an annotation belongs to another demonstration.
+            InvalidInput, Mismatch: see `check_sources`.
             OutputExists: `path` holds something else, or a dataset made with other settings, and
                 `overwrite` is false; the message says which settings.
             CannotWrite: another process is at work on it, or the disk refuses.
             BrokenFile: its manifest can't be read.
         """
-        if not sources:
-            raise InvalidInput("sources: expected at least one demonstration, got none")
-        for demonstration, annotation in sources:
-            annotation.check_matches(demonstration)
+        check_sources(sources)
         self.path = path = Path(path)
         hashes = tuple((d.content_hash(), a.content_hash()) for d, a in sources)
         # As JSON gives it back, to be compared.

@@ -2,20 +2,25 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections import Counter
+from contextlib import closing
 
 import numpy as np
 import pytest
 
+from sart_toolkit.augment import engine
 from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
-from sart_toolkit.augment.engine import augment_demonstration
+from sart_toolkit.augment.engine import augment_demonstration, augment_sources
 from sart_toolkit.augment.executors import Attempt, RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.strategies import STRATEGIES
+from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends.interface import Backend, Capabilities, Contact
 from sart_toolkit.data import writer
 from sart_toolkit.data.dataset import load_dataset
@@ -26,6 +31,7 @@ from sart_toolkit.data.records import (
     apply_action,
     convergence_waypoint,
 )
+from sart_toolkit.data.storage import save_annotation, save_demonstration
 from sart_toolkit.errors import (
     CannotWrite,
     InvalidInput,
@@ -36,6 +42,9 @@ from sart_toolkit.errors import (
     UnknownName,
 )
 from sart_toolkit.poses import interpolate, log_rotation, pose
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import record_demonstration
+from sart_toolkit.tasks.task import Placement
 
 CROWDED = AugmentConfig(n=5, seed=3, duration=0.8)
 
@@ -63,7 +72,7 @@ def crowded_dataset(peg_demonstration, crowded, make_peg_backend, tmp_path_facto
 def strategy_dataset(
     request, peg_demonstration, peg_annotation, make_peg_backend, tmp_path_factory
 ):
-    if STRATEGIES[request.param].plans:
+    if request.param == "sart_planned":
         pytest.importorskip("ompl")
     out = tmp_path_factory.mktemp(request.param) / "dataset"
     config = AugmentConfig(n=9, strategy=request.param)
@@ -203,7 +212,7 @@ def test_an_attempt_depends_on_seed_sphere_and_number_alone(
     make = RestoreExecutor(
         peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig(n=5)
     ).attempt
-    for episode in reversed(peg_dataset):
+    for episode in reversed(list(peg_dataset)):
         p = episode.provenance
         again = make(AttemptKey(0, p.sphere, p.k))
         assert again.outcome == "kept"
@@ -301,8 +310,9 @@ def test_what_touches_in_spite_of_the_proof_ends_the_segment_at_once(
     make = RestoreExecutor(
         peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig()
     ).attempt
-    assert make(AttemptKey(0, 0, 0)) == Attempt(
-        "contact block / peg", None, "contact block / peg: stopped there"
+    key = AttemptKey(0, 0, 0)
+    assert make(key) == Attempt(
+        key, "contact block / peg", None, "contact block / peg: stopped there"
     )
     assert len(steps) == 7
 
@@ -493,6 +503,51 @@ def test_an_interruption_while_the_directory_is_set_up_can_be_resumed(
     assert augment(crowded, tmp_path / "d").content_hash == crowded_dataset.content_hash
 
 
+_KILLED = """
+import functools, sys
+from pathlib import Path
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
+from sart_toolkit.backends import make_backend
+from sart_toolkit.data.storage import load_annotation, load_demonstration
+from sart_toolkit.robots import get_robot
+from sart_toolkit.tasks import get_task
+
+path = Path(sys.argv[1])
+task = get_task("peg_in_hole")
+demonstration = load_demonstration(path / "demo.h5")
+size = demonstration.steps.cameras["wrist"].rgb.shape[1]
+make = functools.partial(make_backend, "pybullet", get_robot(task.robot), task.scene, size)
+augment_demonstration(
+    demonstration, load_annotation(path / "annotation.json"), make, path / "d",
+    AugmentConfig(n=5, seed=3, duration=0.8), workers=int(sys.argv[2]),
+    progress=lambda *counts: print(*counts, flush=True),
+)
+"""
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_killed_it_resumes_to_the_same(
+    augment, crowded, crowded_dataset, peg_demonstration, tmp_path, workers
+):
+    save_demonstration(tmp_path / "demo.h5", peg_demonstration)
+    save_annotation(tmp_path / "annotation.json", crowded)
+    for lines in (1, 3):
+        process = subprocess.Popen(
+            [sys.executable, "-c", _KILLED, str(tmp_path), str(workers)],
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        for _ in range(lines):
+            assert process.stdout.readline()
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        assert n_attempts(tmp_path / "d") >= lines
+    dataset = augment(crowded, tmp_path / "d")
+    assert dataset.content_hash == crowded_dataset.content_hash
+    assert [e.content_hash() for e in dataset] == [e.content_hash for e in crowded_dataset.index]
+
+
 _CHAIN = """
 import sys
 import numpy as np
@@ -549,6 +604,91 @@ def test_a_finished_dataset_is_returned_without_another_attempt(
     again = augment(crowded, tmp_path / "d", progress=Interrupt(1), workers=2)
     assert again.content_hash == crowded_dataset.content_hash
     assert again.info["seconds"] > 0
+
+
+# --- several demonstrations ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two_sources(peg_task, peg_model, make_peg_backend, peg_demonstration):
+    """Two demonstrations of peg-in-hole, the second with another hand, and a sphere of each."""
+    operator = ScriptedOperator(
+        peg_task.plan(peg_task.initial_state(peg_model, Placement())), np.random.default_rng(7)
+    )
+    with closing(make_peg_backend()) as backend:
+        other = record_demonstration(backend, peg_task, peg_model, operator, seed=7)
+    sources = []
+    for demonstration, radius in ((peg_demonstration, 0.04), (other, 0.02)):
+        sphere = PrecisionSphere(2, demonstration.steps.measured_Ts_world_tool[2], radius)
+        sources.append((demonstration, Annotation((sphere,), demonstration.content_hash())))
+    return sources
+
+
+def test_the_spheres_of_all_demonstrations_share_the_trajectories(
+    two_sources, make_peg_backend, peg_backend, peg_task, tmp_path
+):
+    config = AugmentConfig(n=8, camera=None, duration=1.0)
+    one, two = (
+        augment_sources(two_sources, make_peg_backend, tmp_path / str(workers), config, workers)
+        for workers in (1, 2)
+    )
+    assert one.content_hash == two.content_hash
+    assert [entry.source for entry in one.index].count(0) == 4
+    assert one.info["n_trajectories"] == 8
+    for entry, episode in zip(one.index, one, strict=True):
+        demonstration = one.sources[entry.source].demonstration
+        p = episode.provenance
+        assert p.demonstration_hash == demonstration.content_hash()
+        Ts, _ = episode.commands(demonstration)
+        actions = episode.actions(demonstration)
+        for t in range(len(Ts) - 1):
+            np.testing.assert_allclose(apply_action(Ts[t], actions[t])[0], Ts[t + 1], atol=1e-9)
+    # The same attempts from different demonstrations are drawn apart.
+    firsts = [episode.provenance.T_world_sampled for episode in one][:2]
+    keys = [source.annotation.spheres[0].T_world_key for source in one.sources]
+    directions = [(T - key)[:3, 3] / np.linalg.norm((T - key)[:3, 3])
+                  for T, key in zip(firsts, keys, strict=True)]  # fmt: skip
+    assert directions[0] @ directions[1] < 0.99
+    found = validate_dataset(tmp_path / "1", peg_backend.robot, peg_task.scene)
+    assert found.problems == {} and found.episodes == 6
+
+
+def test_a_demonstration_s_episodes_do_not_depend_on_those_after_it(
+    two_sources, make_peg_backend, tmp_path
+):
+    config = AugmentConfig(n=6, camera=None, duration=1.0, allocation="equal")
+    both = augment_sources(two_sources, make_peg_backend, tmp_path / "both", config)
+    config = dataclasses.replace(config, n=3)
+    alone = augment_sources(two_sources[:1], make_peg_backend, tmp_path / "alone", config)
+    of_first = [entry.content_hash for entry in both.index if entry.source == 0]
+    assert of_first == [entry.content_hash for entry in alone.index]
+
+
+# --- executors ----------------------------------------------------------------------------------
+
+
+class Backwards(RestoreExecutor):
+    """Makes its attempts in an order of its own, which takes one process."""
+
+    parallel = False
+
+    def attempts(self, keys):
+        return map(self.attempt, reversed(list(keys)))
+
+
+def test_an_executor_may_choose_its_order_and_changes_nothing_by_it(
+    augment, crowded, crowded_dataset, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(engine, "get_executor", lambda name: Backwards)
+    with pytest.raises(InvalidInput, match="workers: executor 'restore' needs 1 process, got 2"):
+        augment(crowded, tmp_path / "d", workers=2)
+    assert augment(crowded, tmp_path / "d").content_hash == crowded_dataset.content_hash
+
+
+def test_an_unknown_executor_is_refused_with_the_nearest_name(annotate, augment, tmp_path):
+    with pytest.raises(UnknownName, match="executor 'restroe': did you mean 'restore'"):
+        augment(annotate((0, 0.05)), tmp_path / "d", AugmentConfig(executor="restroe"))
+    assert not (tmp_path / "d").exists()
 
 
 # --- refusals -----------------------------------------------------------------------------------
@@ -675,6 +815,16 @@ def test_an_attempt_on_a_backend_that_cannot_restore_is_refused(
             AttemptKey(0, 0, 0)
         )
     arm.close()
+
+
+def test_without_rendering_pictures_are_refused_and_their_lack_is_not(
+    annotate, augment, peg_backend, peg_demonstration, monkeypatch
+):
+    blind = dataclasses.replace(peg_backend.capabilities, renders=False)
+    monkeypatch.setattr(peg_backend, "capabilities", blind)
+    RestoreExecutor.check(peg_backend, [peg_demonstration], AugmentConfig(camera=None))
+    with pytest.raises(MissingCapability, match="can't render; augment without pictures, or use"):
+        RestoreExecutor.check(peg_backend, [peg_demonstration], AugmentConfig())
 
 
 @pytest.mark.parametrize("workers", [0, -1])

@@ -242,6 +242,12 @@ def test_sources_are_checked(shown, tmp_path):
         DatasetWriter(tmp_path / "d", [], {})
     with pytest.raises(Mismatch, match="annotation was made for another demonstration"):
         DatasetWriter(tmp_path / "d", [(shown(0)[0], shown(1)[1])], {})
+    demonstration, annotation = shown(0)
+    for what in ("task", "robot"):
+        other = dataclasses.replace(demonstration, **{what: "another"})
+        spheres = dataclasses.replace(annotation, demonstration_hash=other.content_hash())
+        with pytest.raises(Mismatch, match=rf"of different {what}s \(another, no\w+\); make a"):
+            DatasetWriter(tmp_path / "d", [(demonstration, annotation), (other, spheres)], {})
     assert not (tmp_path / "d").exists()
 
 
@@ -264,7 +270,7 @@ def test_a_full_disk_is_told_and_resumed_from(carry_out, tmp_path, monkeypatch):
         left[0] -= 1
         if left[0] < 0:
             raise CannotWrite(f"{path}: No space left on device")
-        save(path, episode)
+        return save(path, episode)
 
     with monkeypatch.context() as patched, pytest.raises(CannotWrite, match="No space left"):
         patched.setattr(writer_module, "save_episode", full)
