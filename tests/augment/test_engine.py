@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import os
 import re
@@ -186,7 +187,7 @@ def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_
         peg_annotation,
         AugmentConfig(strategy=strategy_dataset.info["config"]["strategy"]),
     )
-    for episode in strategy_dataset[:4]:
+    for episode in itertools.islice(strategy_dataset, 4):
         t = episode.provenance.t_star
         peg_backend.restore(demonstration.states[t])
         steps = episode.steps
