@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sart_toolkit.annotate.suggest import ExactSurroundings, SuggestConfig, suggest_annotation
     from sart_toolkit.augment.config import AugmentConfig
-    from sart_toolkit.augment.engine import augment_demonstration
+    from sart_toolkit.augment.engine import augment_demonstration, augment_sources
+    from sart_toolkit.augment.strategies import Proposal, Strategy
     from sart_toolkit.augment.validate import validate_dataset
     from sart_toolkit.backends import make_backend
     from sart_toolkit.collision.certificate import certify
     from sart_toolkit.collision.demonstrated import DemonstratedScene
     from sart_toolkit.collision.model import CollisionModel
     from sart_toolkit.data.assets import asset
+    from sart_toolkit.data.dataset import load_dataset
     from sart_toolkit.data.sampling import SamplingConfig
     from sart_toolkit.data.storage import (
         load_annotation,
-        load_dataset,
         load_demonstration,
         save_annotation,
         save_demonstration,
@@ -47,20 +48,23 @@ _HOMES = {
     "EvaluateConfig": "evaluate.rollout",
     "ExactSurroundings": "annotate.suggest",
     "Placement": "tasks.task",
+    "Proposal": "augment.strategies",
     "RobotModel": "robots.model",
     "SamplingConfig": "data.sampling",
     "ScriptedOperator": "record.scripted",
+    "Strategy": "augment.strategies",
     "SuggestConfig": "annotate.suggest",
     "TrainConfig": "learn.training",
     "asset": "data.assets",
     "augment_demonstration": "augment.engine",
+    "augment_sources": "augment.engine",
     "certify": "collision.certificate",
     "evaluate_skill": "evaluate.rollout",
     "film_rollout": "report.video",
     "get_robot": "robots",
     "get_task": "tasks",
     "load_annotation": "data.storage",
-    "load_dataset": "data.storage",
+    "load_dataset": "data.dataset",
     "load_demonstration": "data.storage",
     "load_skill": "learn.skill",
     "make_backend": "backends",
@@ -82,13 +86,16 @@ __all__ = [
     "EvaluateConfig",
     "ExactSurroundings",
     "Placement",
+    "Proposal",
     "RobotModel",
     "SamplingConfig",
     "ScriptedOperator",
+    "Strategy",
     "SuggestConfig",
     "TrainConfig",
     "asset",
     "augment_demonstration",
+    "augment_sources",
     "certify",
     "evaluate_skill",
     "film_rollout",

@@ -16,7 +16,8 @@ from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import make_backend
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.collision.demonstrated import DemonstratedScene
-from sart_toolkit.data.records import Annotation, Dataset, Demonstration
+from sart_toolkit.data.dataset import Dataset
+from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot

@@ -12,9 +12,9 @@ import functools
 import importlib.metadata
 import itertools
 import json
-import math
 import os
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from sart_toolkit import doctor
 from sart_toolkit.annotate.session import AnnotationSession
@@ -31,16 +32,16 @@ from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.backends.interface import Backend
+from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.cloud import fuse_cloud
 from sart_toolkit.collision.demonstrated import DemonstratedScene
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
+from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     CONTROL_HZ,
     Annotation,
     CameraRecord,
-    Dataset,
     Demonstration,
     Episode,
     PrecisionSphere,
@@ -49,6 +50,7 @@ from sart_toolkit.data.records import (
     library_versions,
 )
 from sart_toolkit.data.storage import load_demonstration, save_demonstration
+from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import InvalidInput, MotionRejected, SartError, Unreachable, unknown_name
 from sart_toolkit.learn.frames import input_size
 from sart_toolkit.learn.policies import POLICIES
@@ -123,7 +125,8 @@ def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[s
     device = resolve_device(config.device)
     window_config = WindowConfig(config.cameras, config.image_size, config.history)
     with tempfile.TemporaryDirectory() as scratch:
-        windows = open_windows(_synthetic_dataset(2), window_config, Path(scratch))
+        few = _synthetic_dataset(Path(scratch) / "dataset", 2)
+        windows = open_windows(few, window_config, Path(scratch))
     first = torch.arange(config.batch_size) % len(windows.history)
     bare_step = _stepper(config, itertools.repeat(windows.to(device).batch(first)))
     # The first steps choose and compile kernels.
@@ -133,14 +136,13 @@ def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[s
     # At most 39 generated trajectories, and two epochs at least so that an epoch's end is counted.
     per_trajectory = _DEMONSTRATION_STEPS // 2 + _SEGMENT_STEPS
     n_episodes = min(39, max(2, n_steps * config.batch_size // (2 * per_trajectory)))
-    dataset = _synthetic_dataset(n_episodes)
     n_windows = _DEMONSTRATION_STEPS + n_episodes * per_trajectory
     n_batches = -(-n_windows // config.batch_size)
     config = dataclasses.replace(config, epochs=-(-n_steps // n_batches))
 
     loop_seconds: list[float] = []
     bare_seconds: list[float] = []
-    last = time.perf_counter()
+    last = 0.0
 
     def between_steps(done: int, total: int, text: str) -> None:
         nonlocal last
@@ -152,7 +154,9 @@ def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[s
         last = time.perf_counter()
 
     with tempfile.TemporaryDirectory() as scratch:
-        result = train(dataset, config, Path(scratch), progress=between_steps)
+        dataset = _synthetic_dataset(Path(scratch) / "dataset", n_episodes)
+        last = time.perf_counter()
+        result = train(dataset, config, Path(scratch) / "skill", progress=between_steps)
     # The first block warms up.
     blocks = [slice(i * per_block, (i + 1) * per_block) for i in range(1, n_blocks + 1)]
     loop_images = n_windows / n_batches * config.history * per_block
@@ -204,62 +208,52 @@ def _synchronise(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def _synthetic_steps(n: int, rng: np.random.Generator) -> Steps:
-    """Steps with random square pictures."""
-    commanded = np.tile(pose((0.4, 0.0, 0.3)), (n, 1, 1))
-    commanded[:, :3, 3] += np.cumsum(rng.normal(0, 0.005, (n, 3)), 0)
-    size = (n, _RECORDED_SIZE, _RECORDED_SIZE)
-    camera = CameraRecord(
-        rgb=np.frombuffer(rng.bytes(3 * math.prod(size)), np.uint8).reshape(*size, 3),
-        depth=np.zeros(size, np.float32),
-        intrinsics=np.diag([_RECORDED_SIZE, _RECORDED_SIZE, 1.0]),
-        T_tool_camera=np.eye(4),
-    )
-    joints = np.zeros((n, 6))
-    gripper = rng.uniform(0, 1, n)
-    return Steps(
-        joint_positions=joints,
-        joint_velocities=joints,
-        commanded_joint_positions=joints,
-        measured_Ts_world_tool=commanded,
-        commanded_Ts_world_tool=commanded,
-        measured_gripper=gripper,
-        commanded_gripper=gripper,
-        contact_force=np.zeros(n),
-        cameras={"wrist": camera},
-    )
+def _synthetic_dataset(path: Path, n_episodes: int, flat: bool = False) -> Dataset:
+    """A dataset of 128x128 pictures, shaped as augmentation makes them.
 
+    The pictures are noise, or `flat`: a plain one with a box in it, as easy to compress as any.
+    """
+    rng = np.random.default_rng(0)
 
-class _SyntheticEpisodes:
-    """Episodes made when asked for, and not kept."""
+    def pictures(n: int) -> NDArray[np.uint8]:
+        if not flat:
+            return rng.integers(0, 256, (n, 128, 128, 3), dtype=np.uint8)
+        plain = np.empty((n, 128, 128, 3), np.uint8)
+        plain[:] = rng.integers(0, 256, (n, 1, 1, 3), dtype=np.uint8)
+        for picture, (u, v) in zip(plain, rng.integers(0, 96, (n, 2)), strict=True):
+            picture[u : u + 32, v : v + 32] = 255 - picture[0, 0]
+        return plain
 
-    def __init__(self, n: int, demonstration: Demonstration) -> None:
-        self._n = n
-        self._demonstration_hash = demonstration.content_hash()
-        self._key = demonstration.steps.measured_Ts_world_tool[0]
+    def steps(n: int) -> Steps:
+        commanded = np.tile(pose((0.4, 0.0, 0.3)), (n, 1, 1))
+        commanded[:, :3, 3] += np.cumsum(rng.normal(0, 0.005, (n, 3)), 0)
+        camera = CameraRecord(
+            rgb=pictures(n),
+            depth=np.zeros((n, 128, 128), np.float32),
+            intrinsics=np.diag([128.0, 128.0, 1.0]),
+            T_tool_camera=np.eye(4),
+        )
+        joints = np.zeros((n, 6))
+        gripper = rng.uniform(0, 1, n)
+        return Steps(
+            joint_positions=joints,
+            joint_velocities=joints,
+            commanded_joint_positions=joints,
+            measured_Ts_world_tool=commanded,
+            commanded_Ts_world_tool=commanded,
+            measured_gripper=gripper,
+            commanded_gripper=gripper,
+            contact_force=np.zeros(n),
+            cameras={"wrist": camera},
+        )
 
-    def __len__(self) -> int:
-        return self._n
-
-    def __iter__(self) -> Iterator[Episode]:
-        for k in range(self._n):
-            steps = _synthetic_steps(_SEGMENT_STEPS, np.random.default_rng([0, k]))
-            t_star = _DEMONSTRATION_STEPS // 2
-            yield Episode(
-                steps,
-                Provenance(self._demonstration_hash, 0, k, t_star, self._key, 0, "sart", "paper"),
-            )
-
-
-def _synthetic_dataset(n_episodes: int, lazy: bool = False) -> Dataset:
-    """A dataset of random pictures, shaped as augmentation makes them."""
     n = _DEMONSTRATION_STEPS
     demonstration = Demonstration(
         task="synthetic",
         task_parameters={},
         robot="none",
         backend="none",
-        steps=_synthetic_steps(n, np.random.default_rng(0)),
+        steps=steps(n),
         timestamps=np.arange(n) / 10,
         body_Ts_world={},
         success=np.ones(n, bool),
@@ -270,10 +264,17 @@ def _synthetic_dataset(n_episodes: int, lazy: bool = False) -> Dataset:
         device="none",
         seconds=0.0,
     )
-    key = demonstration.steps.measured_Ts_world_tool[0]
-    annotation = Annotation((PrecisionSphere(0, key, 0.1),), demonstration.content_hash())
-    episodes: Any = _SyntheticEpisodes(n_episodes, demonstration)
-    return Dataset(demonstration, annotation, episodes if lazy else tuple(episodes))
+    sha, key = demonstration.content_hash(), demonstration.steps.measured_Ts_world_tool[0]
+    annotation = Annotation((PrecisionSphere(0, key, 0.1),), sha)
+    episodes = (
+        Episode(
+            steps(_SEGMENT_STEPS),
+            Provenance(sha, 0, 0, k, n // 2, key, 0, "sart", "paper"),
+        )
+        for k in range(n_episodes)
+    )
+    info = {"task": "synthetic", "seconds": 0.0}
+    return write_dataset(path, [(demonstration, annotation)], episodes, info)
 
 
 # --- training data ------------------------------------------------------------------------------
@@ -282,9 +283,9 @@ def _synthetic_dataset(n_episodes: int, lazy: bool = False) -> Dataset:
 def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
     """Training from the file of images: its memory, and images/s over a copy in memory.
 
-    As many episodes as asked for are made up one by one and written by `open_windows`, then steps
-    are taken on random batches from the file; the peak of this process's memory so far, its
-    imports included, is what is reported: all of it, and the part that no file backs. Only then the
+    As many episodes as asked for are made up and read by `open_windows`, then steps are taken on
+    random batches from its file; the peak of this process's memory so far, its imports included,
+    is what is reported: all of it, and the part that no file backs. Only then the
     images are copied into memory, and blocks of steps on batches from the file and from the copy
     alternate, so that whatever else the machine does slows both; the ratio is the median over
     blocks. Last, blocks of steps after the kernel was told to drop what it keeps of the file.
@@ -318,7 +319,7 @@ def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
                 _say(f"read {done}/{total}")
 
         at_start = _memory("VmRSS")
-        dataset = _synthetic_dataset(options.episodes, lazy=True)
+        dataset = _synthetic_dataset(Path(scratch) / "dataset", options.episodes, flat=True)
         started = time.perf_counter()
         windows = open_windows(dataset, window_config, Path(scratch), reading)
         writing_seconds = time.perf_counter() - started
@@ -402,6 +403,94 @@ def _drop_from_cache(file: Path, windows: Windows) -> None:
         os.posix_fadvise(opened.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
+# --- datasets -----------------------------------------------------------------------------------
+
+_OPEN = """
+from sart_toolkit.data.dataset import load_dataset
+from pathlib import Path
+started = time.perf_counter()
+result = {"episodes": len(load_dataset(Path(sys.argv[1])))}
+"""
+_INFO = """
+from sart_toolkit.cli import main
+main(["info", sys.argv[1], "--json"])
+result = {}
+"""
+_AUGMENT = """
+from pathlib import Path
+from bench import augmentation
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
+demonstration, annotation, make = augmentation(sys.argv[2], int(sys.argv[3]))
+started = time.perf_counter()
+dataset = augment_demonstration(
+    demonstration, annotation, make, Path(sys.argv[1]), AugmentConfig(int(sys.argv[4]))
+)
+result = {"kept": len(dataset)}
+"""
+_MEASURED = """
+import json, sys, time
+started = time.perf_counter()
+{}
+result["seconds"] = time.perf_counter() - started
+status = open("/proc/self/status").read()
+# Of this program alone: what `getrusage` says counts the memory of the one that started it.
+result["peak_mb"] = int(status.split("VmHWM:")[1].split()[0]) / 1024
+print(json.dumps(result))
+"""
+
+
+def bench_dataset(arguments: Sequence[str]) -> dict[str, Any]:
+    """Seconds and peak memory of opening a large dataset and of generating a small and a large one.
+
+    The large dataset is synthetic: 20 steps an episode, 128x128 RGB-D, pictures that are easy to
+    compress. Each figure is of a program of its own. Opening is `load_dataset` after its imports;
+    `info` is the whole command, from its imports on.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py dataset", description=bench_dataset.__doc__)
+    parser.add_argument("--episodes", type=int, default=10_000, help="of the synthetic dataset")
+    parser.add_argument("--n", type=int, nargs="+", default=[40, 400], help="trajectories")
+    parser.add_argument("--task", default="peg_in_hole", help=", ".join(TASKS))
+    parser.add_argument("--image-size", type=int, default=128, help="of augmentation [pixels]")
+    options = parser.parse_args(arguments)
+    check_positive("--episodes", options.episodes)
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "synthetic"
+        started = time.perf_counter()
+        _synthetic_dataset(path, options.episodes, flat=True)
+        making = time.perf_counter() - started
+        _say(f"{options.episodes} episodes made in {making:.0f} s")
+        size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+        figures: dict[str, Any] = {
+            "episodes": options.episodes,
+            "size_mb": size / 2**20,
+            "making_seconds": making,
+            "open": _measured(_OPEN, path),
+            "info": _measured(_INFO, path),
+            "augment": {},
+        }
+        for n in options.n:
+            out = Path(scratch) / str(n)
+            found = _measured(_AUGMENT, out, options.task, options.image_size, n)
+            figures["augment"][str(n)] = found
+            _say(f"augment --n {n}: {found['peak_mb']:.0f} MB, {found['seconds']:.0f} s")
+    return figures
+
+
+def _measured(work: str, *arguments: Any) -> dict[str, Any]:
+    """What a program of its own says of its work, with its seconds and peak memory."""
+    run = subprocess.run(
+        [sys.executable, "-c", _MEASURED.format(work), *map(str, arguments)],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
+        capture_output=True,
+        text=True,
+    )
+    if run.returncode:
+        raise SartError(f"a measured program failed: {run.stderr.strip().splitlines()[-1]}")
+    found: dict[str, Any] = json.loads(run.stdout.splitlines()[-1])
+    return found
+
+
 # --- augmentation -------------------------------------------------------------------------------
 
 
@@ -417,15 +506,7 @@ def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args(arguments)
     check_positive("--repeats", options.repeats)
-    task = get_task(options.task)
-    robot = get_robot(task.robot)
-    make = functools.partial(make_backend, "pybullet", robot, task.scene, options.image_size)
-    model = RobotModel(robot, task.scene.held)
-    plan = task.plan(task.initial_state(model, Placement()))
-    operator = ScriptedOperator(plan, np.random.default_rng(0))
-    demonstration = record_demonstration(make(), task, model, operator)
-    scene = DemonstratedScene(demonstration, robot, task.scene)
-    annotation = suggest_annotation(demonstration, ExactSurroundings(scene))
+    demonstration, annotation, make = augmentation(options.task, options.image_size)
     per_second, over_wall = [], []
     with tempfile.TemporaryDirectory() as scratch:
         for turn in range(options.repeats):
@@ -448,6 +529,21 @@ def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
         "processes": 1,
         "repeats": options.repeats,
     }
+
+
+def augmentation(
+    task_name: str, image_size: int
+) -> tuple[Demonstration, Annotation, BackendFactory]:
+    """A demonstration of a task, its suggested spheres, and what makes its robot and scene."""
+    task = get_task(task_name)
+    robot = get_robot(task.robot)
+    make = functools.partial(make_backend, "pybullet", robot, task.scene, image_size)
+    model = RobotModel(robot, task.scene.held)
+    plan = task.plan(task.initial_state(model, Placement()))
+    operator = ScriptedOperator(plan, np.random.default_rng(0))
+    demonstration = record_demonstration(make(), task, model, operator)
+    scene = DemonstratedScene(demonstration, robot, task.scene)
+    return demonstration, suggest_annotation(demonstration, ExactSurroundings(scene)), make
 
 
 # --- certificates -------------------------------------------------------------------------------
@@ -854,6 +950,7 @@ BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "annotate": bench_annotate,
     "augment": bench_augment,
     "certificate": bench_certificate,
+    "dataset": bench_dataset,
     "step": bench_step,
     "train": bench_train,
     "training-data": bench_training_data,

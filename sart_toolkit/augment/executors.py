@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import abc
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,8 +11,10 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner, path_deviation
+from sart_toolkit.augment.strategies import strategy_name
 from sart_toolkit.backends.interface import Backend, Observation
 from sart_toolkit.collision.certificate import Certificate, certify
+from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     CONTROL_HZ,
     CONTROL_PER_RECORD,
@@ -19,102 +23,181 @@ from sart_toolkit.data.records import (
     Episode,
     Provenance,
 )
-from sart_toolkit.errors import MotionRejected, Unreachable
+from sart_toolkit.errors import (
+    Mismatch,
+    MissingCapability,
+    MotionRejected,
+    Unreachable,
+    unknown_name,
+)
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.record.recorder import StepRecorder
+from sart_toolkit.registry import lookup
 from sart_toolkit.scenes.spec import SceneSpec
 
-KEPT = "kept"
-# By no more than this [m] may any point of a body be moved that isn't carried.
+# By no more than this [m] may any point of a body be moved that isn't grasped.
 _MOVED = 0.001
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """The outcome of one try: the episode, or the reason why it was rejected.
+    """The outcome of an attempt: the episode, or the reason why it was rejected.
 
-    `outcome` is the same for all tries that fail alike; `detail` tells this one's figures.
+    `outcome` is the same for all attempts that fail alike; `detail` tells this one's figures.
     """
 
+    key: AttemptKey
     outcome: str
     episode: Episode | None
     detail: str = ""
 
 
-class SegmentMaker:
-    """Makes tries (sphere, k) of one demonstration and annotation on a backend."""
+class SegmentExecutor(abc.ABC):
+    """Makes attempts at segments of demonstrations on a backend.
+
+    Attributes:
+        parallel: whether an attempt depends on its key alone, so that several processes can share
+            the attempts.
+    """
+
+    parallel: bool
 
     def __init__(
         self,
         backend: Backend,
-        demonstration: Demonstration,
-        annotation: Annotation,
+        sources: Sequence[tuple[Demonstration, Annotation]],
         config: AugmentConfig,
     ) -> None:
-        """Make tries on `backend`, the robot in the demonstration's scene.
+        """Make attempts on `backend`, the robot in the demonstrations' scene."""
+        self._backend, self._sources, self._config = backend, sources, config
+        self._planners: dict[int, SegmentPlanner] = {}
+
+    @classmethod
+    def check(
+        cls, backend: Backend, demonstrations: Sequence[Demonstration], config: AugmentConfig
+    ) -> None:
+        """Return if attempts at segments of the demonstrations can be made on `backend`.
+
+        Raises:
+            UnknownName: the backend has no such camera.
+            MissingCapability: pictures are wanted and the backend can't render.
+        """
+        if config.camera is None:
+            return
+        if config.camera not in backend.cameras:
+            raise unknown_name("camera", config.camera, backend.cameras)
+        if not backend.capabilities.renders:
+            raise MissingCapability(
+                f"backend {backend.name!r} can't render; augment without pictures, or use another "
+                "backend"
+            )
+
+    @abc.abstractmethod
+    def attempts(self, keys: Iterable[AttemptKey]) -> Iterator[Attempt]:
+        """The attempts with the given keys, each once, in an order of the executor's choice.
+
+        What isn't proved to keep the margin is not executed. Any contact of the robot, or of what
+        it holds or has grasped there, with anything else at any physics step ends the execution; an
+        object that slips in the grasp or is moved, or a measured motion that can't be proved clear,
+        rejects the segment.
+        """
+
+    def planner(self, source: int) -> SegmentPlanner:
+        """What plans the segments of a source.
 
         Raises:
             Mismatch: the demonstration doesn't tell where the scene's bodies were.
         """
-        self._backend = backend
-        self._demonstration, self._annotation = demonstration, annotation
-        self._config = config
-        self._planner = SegmentPlanner(
-            backend.robot, backend.scene, demonstration, annotation, config
-        )
+        if source not in self._planners:
+            self._planners[source] = SegmentPlanner(
+                self._backend.robot,
+                self._backend.scene,
+                *self._sources[source],
+                self._config,
+                source,
+            )
+        return self._planners[source]
 
-    def __call__(self, sphere: int, k: int) -> Attempt:
-        """The k-th try from a sphere: sample, prove, move there, check, and reverse the record.
 
-        The robot starts from the restored state of waypoint t*, at the pose commanded there. What
-        isn't proved to keep the margin is not executed. Any contact of the robot, or of what it
-        holds or has grasped there, with anything else at any physics step ends the execution; an
-        object that slips in the grasp or is moved, or a measured motion that can't be proved clear,
-        rejects the segment.
+class RestoreExecutor(SegmentExecutor):
+    """Starts every attempt from the restored state of waypoint t*, at the pose commanded there."""
 
-        Args:
-            sphere: which sphere.
-            k: which try; it alone decides the random numbers, with the seed and the sphere.
+    parallel = True
+
+    @classmethod
+    def check(
+        cls, backend: Backend, demonstrations: Sequence[Demonstration], config: AugmentConfig
+    ) -> None:
+        """Return if attempts at segments of the demonstrations can be made on `backend`.
+
+        Raises:
+            UnknownName: the backend has no such camera.
+            MissingCapability: the backend can't restore states, or pictures are wanted and it can't
+                render.
+            Mismatch: a demonstration holds no saved states.
+        """
+        if not backend.capabilities.can_restore:
+            raise MissingCapability(
+                f"backend {backend.name!r} can't restore states, which executor 'restore' needs; "
+                "use another backend"
+            )
+        super().check(backend, demonstrations, config)
+        if not all(demonstration.states for demonstration in demonstrations):
+            raise Mismatch(
+                "the demonstration holds no saved states; record it on a backend that can restore"
+            )
+
+    def attempts(self, keys: Iterable[AttemptKey]) -> Iterator[Attempt]:
+        """The attempts in the order of their keys."""
+        return map(self.attempt, keys)
+
+    def attempt(self, key: AttemptKey) -> Attempt:
+        """One attempt: sample, prove, move there, check, and reverse the record.
 
         Raises:
             MissingCapability: the backend can't restore states.
         """
-        proposal, rng = self._planner.proposal(sphere, k)
+        planner = self.planner(key.source)
+        demonstration = self._sources[key.source][0]
+        proposal, rng = planner.proposal(key.sphere, key.k)
         t_star = proposal.t_star
         try:
-            motion, certificate = self._planner.plan(proposal, rng)
-            recorder, joint_path = self._execute(motion, t_star)
-            proof = self._proof(motion, certificate, joint_path, t_star)
+            motion, certificate = planner.plan(proposal, rng)
+            recorder, joint_path = self._execute(planner, motion, demonstration, t_star)
+            proof = self._proof(planner, motion, certificate, joint_path, t_star)
         except Unreachable as error:
-            return Attempt("out of reach", None, str(error))
+            return Attempt(key, "out of reach", None, str(error))
         except MotionRejected as error:
             # What stands behind the colon differs each time.
-            return Attempt(str(error).partition(":")[0], None, str(error))
+            return Attempt(key, str(error).partition(":")[0], None, str(error))
         provenance = Provenance(
-            demonstration_hash=self._annotation.demonstration_hash,
-            sphere=sphere,
-            k=k,
+            demonstration_hash=self._sources[key.source][1].demonstration_hash,
+            source=key.source,
+            sphere=key.sphere,
+            k=key.k,
             t_star=t_star,
             T_world_sampled=proposal.T_world_sampled,
             seed=self._config.seed,
-            strategy=self._config.strategy,
-            law=self._config.sampling.law,
+            strategy=strategy_name(self._config.strategy),
+            distribution=self._config.sampling.distribution,
             certificate=proof,
         )
         steps = recorder.steps(slice(None, None, -1))
-        return Attempt(KEPT, Episode(steps, provenance, joint_path))
+        return Attempt(key, KEPT, Episode(steps, provenance, joint_path))
 
-    def _execute(self, motion: Motion, t_star: int) -> tuple[StepRecorder, Array]:
+    def _execute(
+        self, planner: SegmentPlanner, motion: Motion, demonstration: Demonstration, t_star: int
+    ) -> tuple[StepRecorder, Array]:
         """The record of a motion's execution, and the joints `(m, n)` as measured on the way."""
-        backend, steps = self._backend, self._demonstration.steps
+        backend, steps = self._backend, demonstration.steps
         gripper = float(steps.commanded_gripper[t_star])
-        scene = self._planner.scene
+        scene = planner.scene
         carried = scene.phases[t_star].carried
         controller = ToolController(scene.collision.kinematics)
-        backend.restore(self._demonstration.states[t_star])
+        backend.restore(demonstration.states[t_star])
         controller.reset(
             steps.commanded_joint_positions[t_star], steps.commanded_Ts_world_tool[t_star]
         )
@@ -135,18 +218,23 @@ class SegmentMaker:
             else:
                 seen = recorded = recorder.add(controller, gripper, 0.0)
             measured.append(seen.joint_path if len(seen.joint_path) else seen.q[None])
-        check_undisturbed(backend.scene, carried, start, recorded, self._config.grasp_play)
+        check_undisturbed(backend.scene, carried, start, recorded, self._config.slip_tolerance)
         return recorder, np.concatenate(measured)
 
     def _proof(
-        self, motion: Motion, certificate: Certificate, joint_path: Array, t_star: int
+        self,
+        planner: SegmentPlanner,
+        motion: Motion,
+        certificate: Certificate,
+        joint_path: Array,
+        t_star: int,
     ) -> dict[str, Any]:
         """What is proved about a segment: of the path commanded, and of the one measured.
 
         Raises:
             MotionRejected: the measured path can't be proved clear.
         """
-        placed = self._planner.scene.placed(t_star)
+        placed = planner.scene.placed(t_star)
         deviation = path_deviation(placed, motion, joint_path)
         measured = certify(placed, PolylinePath(joint_path))
         if measured.verdict != "free":
@@ -160,6 +248,19 @@ class SegmentMaker:
             "deviation": _micrometres_up(deviation),
             "duration": motion.duration,
         }
+
+
+EXECUTORS = {"restore": "sart_toolkit.augment.executors:RestoreExecutor"}
+
+
+def get_executor(name: str) -> type[SegmentExecutor]:
+    """The class of executors that a name stands for.
+
+    Raises:
+        UnknownName: no such executor; the message offers the nearest.
+    """
+    found: type[SegmentExecutor] = lookup("executor", name, EXECUTORS)
+    return found
 
 
 def check_untouched(backend: Backend, carried: frozenset[str]) -> None:
@@ -181,7 +282,7 @@ def check_undisturbed(
     carried: frozenset[str],
     start: Observation,
     end: Observation,
-    grasp_play: float,
+    slip_tolerance: float,
 ) -> None:
     """Return if what is carried stayed in the grasp and all else where it was.
 
@@ -194,7 +295,7 @@ def check_undisturbed(
         Ts = [seen.Ts_world_body[body.name] for seen in (start, end)]
         most = _MOVED
         if body.name in carried:
-            most = grasp_play
+            most = slip_tolerance
             Ts = [inverse(seen.T_world_tool) @ T for seen, T in zip((start, end), Ts, strict=True)]
         # The farthest that any point of the body has moved.
         corners = np.concatenate([shape.corners() for shape in body.shapes])

@@ -32,22 +32,26 @@ class SegmentPlanner:
         demonstration: Demonstration,
         annotation: Annotation,
         config: AugmentConfig,
+        source: int = 0,
     ) -> None:
-        """Plan for a robot in the demonstration's scene.
+        """Plan for a robot in the scene of the demonstration, the dataset's `source`-th.
 
         Raises:
             Mismatch: the demonstration doesn't tell where the scene's bodies were.
         """
-        self.scene = DemonstratedScene(demonstration, robot, scene, config.grasp_play)
-        self._annotation, self._config = annotation, config
+        self.scene = DemonstratedScene(demonstration, robot, scene, config.slip_tolerance)
+        self._annotation, self._config, self._source = annotation, config, source
 
     def proposal(self, sphere: int, k: int) -> tuple[Proposal, np.random.Generator]:
-        """The k-th draw from a sphere, and the random numbers that follow."""
-        rng = np.random.default_rng([self._config.seed, sphere, k])
-        propose = get_strategy(self._config.strategy)
+        """The k-th draw from a sphere, and the random numbers that follow.
+
+        Their seed is (seed, sphere, k, source).
+        """
+        rng = np.random.default_rng([self._config.seed, sphere, k, self._source])
+        strategy = get_strategy(self._config.strategy)
         demonstration = self.scene.demonstration
         at = self._annotation.spheres[sphere]
-        return propose(demonstration, at, rng, self._config.sampling), rng
+        return strategy.propose(demonstration, at, rng, self._config.sampling), rng
 
     def plan(self, proposal: Proposal, rng: np.random.Generator) -> tuple[Motion, Certificate]:
         """The motion from waypoint t* to a drawn pose, and the proof that it keeps the margin.

@@ -1,25 +1,29 @@
 """Where an augmented segment leads from and to, and whether its path may bend.
 
-A new strategy is one function and one line in `STRATEGIES`.
+A new strategy is one subclass of `Strategy`; in this package also one line in `STRATEGIES`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import abc
 from dataclasses import dataclass
 
 import numpy as np
 
 from sart_toolkit.data.records import Demonstration, PrecisionSphere, convergence_waypoint
 from sart_toolkit.data.sampling import SamplingConfig, sample_in_region, sample_pose
-from sart_toolkit.errors import unknown_name
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.motion.planning import check_planner
 from sart_toolkit.poses import Array, frozen
+from sart_toolkit.registry import lookup
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A segment to try: from the commanded pose of waypoint `t_star` to `T_world_sampled (4,4)`."""
+    """A segment to attempt: from the commanded pose of waypoint `t_star` to `T_world_sampled`.
+
+    `T_world_sampled (4, 4)` is the tool's pose in the world.
+    """
 
     t_star: int
     T_world_sampled: Array
@@ -28,68 +32,106 @@ class Proposal:
         object.__setattr__(self, "T_world_sampled", frozen(self.T_world_sampled))
 
 
-Propose = Callable[[Demonstration, PrecisionSphere, np.random.Generator, SamplingConfig], Proposal]
+class Strategy(abc.ABC):
+    """Draws segments.
 
+    Attributes:
+        plans: whether a segment whose straight line is blocked may bend round obstacles.
+    """
 
-@dataclass(frozen=True)
-class Strategy:
-    """Draws segments by calling `propose`; where it `plans`, they may bend round obstacles."""
-
-    propose: Propose
     plans: bool = False
 
-    def __call__(
+    @abc.abstractmethod
+    def propose(
         self,
         demonstration: Demonstration,
         sphere: PrecisionSphere,
         rng: np.random.Generator,
         config: SamplingConfig,
     ) -> Proposal:
-        """The segment that `propose` draws."""
-        return self.propose(demonstration, sphere, rng, config)
+        """A segment drawn for a sphere of a demonstration.
+
+        Args:
+            demonstration: what was shown.
+            sphere: one of its precision spheres.
+            rng: the only source of what is random.
+            config: how poses are drawn.
+        """
 
 
-def sart(
-    demonstration: Demonstration,
-    sphere: PrecisionSphere,
-    rng: np.random.Generator,
-    config: SamplingConfig,
-) -> Proposal:
+class Sart(Strategy):
     """The paper's strategy: a pose on the sphere, joined at the first waypoint outside it.
 
     Position Eq. (rand_pos): p = c + r [sin phi cos psi, sin phi sin psi, cos phi]. Rotation
     Eq. (rand_ori): R = C dR, its angle within nu_r r. Joining point Eq. (target_pose).
     """
-    return Proposal(convergence_waypoint(demonstration, sphere), sample_pose(sphere, rng, config))
+
+    def propose(
+        self,
+        demonstration: Demonstration,
+        sphere: PrecisionSphere,
+        rng: np.random.Generator,
+        config: SamplingConfig,
+    ) -> Proposal:
+        """A segment from t* to a pose on the sphere."""
+        t_star = convergence_waypoint(demonstration, sphere)
+        return Proposal(t_star, sample_pose(sphere, rng, config))
 
 
-def sart_planned(
-    demonstration: Demonstration,
-    sphere: PrecisionSphere,
-    rng: np.random.Generator,
-    config: SamplingConfig,
-) -> Proposal:
+class SartPlanned(Strategy):
     """A pose in a free-space region, anywhere in its volume; else as the paper's strategy has it.
 
-    Rotation and joining point are those of `sart`.
+    Rotation and joining point are those of `Sart`.
     """
-    draw = sample_in_region if sphere.kind == "free_space" else sample_pose
-    return Proposal(convergence_waypoint(demonstration, sphere), draw(sphere, rng, config))
+
+    plans = True
+
+    def propose(
+        self,
+        demonstration: Demonstration,
+        sphere: PrecisionSphere,
+        rng: np.random.Generator,
+        config: SamplingConfig,
+    ) -> Proposal:
+        """A segment from t* to a pose in the region, or on the sphere."""
+        draw = sample_in_region if sphere.kind == "free_space" else sample_pose
+        return Proposal(convergence_waypoint(demonstration, sphere), draw(sphere, rng, config))
 
 
-STRATEGIES = {"sart": Strategy(sart), "sart_planned": Strategy(sart_planned, plans=True)}
+SART = Sart()
+SART_PLANNED = SartPlanned()
+
+STRATEGIES = {
+    "sart": "sart_toolkit.augment.strategies:SART",
+    "sart_planned": "sart_toolkit.augment.strategies:SART_PLANNED",
+}
 
 
-def get_strategy(name: str) -> Strategy:
-    """The strategy called `name`.
+def get_strategy(strategy: str | Strategy) -> Strategy:
+    """The strategy that a name stands for, or the strategy itself.
 
     Raises:
         UnknownName: no such strategy; the message offers the nearest.
+        InvalidInput: what the name stands for isn't a strategy.
         MissingExtra: it plans, and OMPL isn't installed.
     """
-    if name not in STRATEGIES:
-        raise unknown_name("strategy", name, STRATEGIES)
-    strategy = STRATEGIES[name]
-    if strategy.plans:
+    found = lookup("strategy", strategy, STRATEGIES) if isinstance(strategy, str) else strategy
+    if not isinstance(found, Strategy):
+        raise InvalidInput(f"strategy: expected a Strategy, got {found!r}; make an instance of one")
+    if found.plans:
         check_planner()
-    return strategy
+    return found
+
+
+def strategy_name(strategy: str | Strategy) -> str:
+    """The name by which files note a strategy.
+
+    Raises:
+        InvalidInput: it has none in `STRATEGIES`.
+    """
+    if isinstance(strategy, str):
+        return strategy
+    for name in STRATEGIES:
+        if lookup("strategy", name, STRATEGIES) is strategy:
+            return name
+    raise InvalidInput(f"strategy: {strategy!r} has no name to note in files; add it to STRATEGIES")

@@ -11,22 +11,16 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner, path_deviation
+from sart_toolkit.augment.strategies import strategy_name
 from sart_toolkit.collision.certificate import Certificate, certify
 from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.data.dataset import SUMMARY, Dataset, load_dataset
+from sart_toolkit.data.manifest import EpisodeEntry
 from sart_toolkit.data.records import (
     RECORD_HZ,
-    Annotation,
-    Dataset,
     Demonstration,
     Episode,
     apply_action,
-)
-from sart_toolkit.data.sampling import SamplingConfig
-from sart_toolkit.data.storage import (
-    load_annotation,
-    load_dataset_info,
-    load_demonstration,
-    load_episode,
 )
 from sart_toolkit.errors import BrokenFile, MotionRejected, SartError
 from sart_toolkit.motion.path import PolylinePath
@@ -45,8 +39,8 @@ _POSE_TOLERANCE = 1e-6
 class Validation:
     """What came of checking a dataset.
 
-    `episodes`: how many were looked at; `problems`: what doesn't hold, by the episode's file (or
-    `dataset.json`); `least_clearance` [m]: the smallest that the certificates of the commanded and
+    `episodes`: how many were looked at; `problems`: what doesn't hold, by the episode's file;
+    `least_clearance` [m]: the smallest that the certificates of the commanded and
     of the measured paths prove, `largest_deviation` [m] of the measured paths from the commanded.
     """
 
@@ -68,7 +62,7 @@ def validate_dataset(
     certificates of the joint path commanded and of the one measured; that what it commands is that
     path backwards, and what it measured the measured path backwards; that every commanded pose
     followed by its action gives the next one, also across the join. For the dataset: that it holds
-    the demonstration and the episodes that it lists.
+    the demonstrations and the episodes that it lists. One episode is in memory at a time.
 
     Args:
         path: directory from `sart augment`.
@@ -78,76 +72,66 @@ def validate_dataset(
 
     Raises:
         MissingFile: a file of the dataset isn't there.
-        BrokenFile: generation was interrupted, or demonstration, annotation or `dataset.json`
-            can't be read.
-        Mismatch: the annotation belongs to another demonstration.
+        BrokenFile: generation was interrupted, or a demonstration, an annotation, the manifest or
+            `dataset.json` can't be read.
+        Mismatch: an annotation or a demonstration isn't the one that the dataset was made from.
     """
-    path = Path(path)
-    info = load_dataset_info(path)
-    demonstration = load_demonstration(path / "demo.h5")
-    annotation = load_annotation(path / "annotation.json")
-    annotation.check_matches(demonstration)
+    dataset = load_dataset(path)
+    for source in dataset.sources:
+        source.annotation.check_matches(source.demonstration)
     try:
-        names = [str(name) for name in info["episodes"]]
-        config = AugmentConfig(
-            **{**info["config"], "sampling": SamplingConfig(**info["config"]["sampling"])}
-        )
-        content_hash = info["content_hash"]
+        config = AugmentConfig.from_json(dataset.info["config"])
     except (KeyError, TypeError) as error:
         raise BrokenFile(
-            f"{path / 'dataset.json'}: {error} is missing or wrong; generate again"
+            f"{dataset.path / SUMMARY}: {error} is missing or wrong; generate again"
         ) from error
-    check = _EpisodeCheck(robot, scene, demonstration, annotation, config)
+    check = _EpisodeCheck(robot, scene, dataset, config)
     problems: dict[str, str] = {}
-    episodes: list[Episode] = []
-    for done, name in enumerate(names, 1):
+    for i, entry in enumerate(dataset.index):
         try:
-            episodes.append(load_episode(path / "episodes" / name))
-            check(episodes[-1])
+            check(entry, dataset.episode(i))
         except SartError as error:
-            problems[name] = str(error)
+            problems[entry.name] = str(error)
         if progress is not None:
-            progress(done, len(names))
-    dataset = Dataset(demonstration, annotation, tuple(episodes))
-    if len(episodes) == len(names) and dataset.content_hash() != content_hash:
-        problems["dataset.json"] = "content differs from its hash; generate again"
-    return Validation(len(names), problems, check.least_clearance, check.largest_deviation)
+            progress(i + 1, len(dataset))
+    return Validation(len(dataset), problems, check.least_clearance, check.largest_deviation)
 
 
 class _EpisodeCheck:
     """Checks episodes of one dataset; raises where something doesn't hold."""
 
     def __init__(
-        self,
-        robot: RobotSpec,
-        scene: SceneSpec,
-        demonstration: Demonstration,
-        annotation: Annotation,
-        config: AugmentConfig,
+        self, robot: RobotSpec, scene: SceneSpec, dataset: Dataset, config: AugmentConfig
     ) -> None:
-        self._demonstration = demonstration
-        self._hash = annotation.demonstration_hash
+        self._sources = dataset.sources
         self._config = config
-        self._planner = SegmentPlanner(robot, scene, demonstration, annotation, config)
+        self._planners = [
+            SegmentPlanner(robot, scene, source.demonstration, source.annotation, config, i)
+            for i, source in enumerate(dataset.sources)
+        ]
         self.least_clearance = np.inf
         self.largest_deviation = 0.0
 
-    def __call__(self, episode: Episode) -> None:
+    def __call__(self, entry: EpisodeEntry, episode: Episode) -> None:
         p = episode.provenance
-        if p.demonstration_hash != self._hash:
-            raise MotionRejected("provenance: it belongs to another demonstration")
-        if (p.seed, p.strategy, p.law) != (
-            self._config.seed, self._config.strategy, self._config.sampling.law
-        ):  # fmt: skip
-            raise MotionRejected("provenance: made with another seed, strategy or law")
-        proposal, rng = self._planner.proposal(p.sphere, p.k)
+        if (p.source, p.sphere, p.k) != entry.key:
+            raise MotionRejected("provenance: it is of another attempt than the index says")
+        made_with = (
+            self._config.seed,
+            strategy_name(self._config.strategy),
+            self._config.sampling.distribution,
+        )
+        if (p.seed, p.strategy, p.distribution) != made_with:
+            raise MotionRejected("provenance: made with another seed, strategy or distribution")
+        planner = self._planners[p.source]
+        proposal, rng = planner.proposal(p.sphere, p.k)
         far = np.abs(proposal.T_world_sampled - p.T_world_sampled).max()
         if p.t_star != proposal.t_star or far > _POSE_TOLERANCE:
             raise MotionRejected("provenance: seed, sphere and k lead to another pose or waypoint")
         if not p.certificate:
             raise MotionRejected("certificate: there is none")
-        motion, commanded = self._planner.plan(proposal, rng)
-        placed = self._planner.scene.placed(p.t_star)
+        motion, commanded = planner.plan(proposal, rng)
+        placed = planner.scene.placed(p.t_star)
         measured = certify(placed, PolylinePath(episode.joint_path))
         deviation = path_deviation(placed, motion, episode.joint_path)
         self._compare(p.certificate, "commanded", commanded)
@@ -159,7 +143,7 @@ class _EpisodeCheck:
             )
         self.largest_deviation = max(self.largest_deviation, deviation)
         _check_reversal(episode, motion, placed)
-        _check_actions(episode, self._demonstration)
+        _check_actions(episode, self._sources[p.source].demonstration)
 
     def _compare(self, stated: Mapping[str, Any], which: str, found: Certificate) -> None:
         claim = Certificate.from_json(stated[which])

@@ -15,12 +15,13 @@ import numpy as np
 
 from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.executors import KEPT, SegmentMaker
+from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.benchmark.cells import Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     CONTROL_HZ,
     PHYSICS_HZ,
@@ -105,9 +106,9 @@ class _Segments:
     def __init__(self, cells: Sequence[Cell], config: SegmentsConfig) -> None:
         self._cells = {cell.name: cell for cell in cells}
         self._augment = AugmentConfig(seed=config.seed, camera=None)
-        self._open: tuple[str, Backend, Annotation, SegmentPlanner, SegmentMaker] | None = None
+        self._open: tuple[str, Backend, Annotation, SegmentPlanner, RestoreExecutor] | None = None
 
-    def _opened(self, name: str) -> tuple[Annotation, SegmentPlanner, SegmentMaker]:
+    def _opened(self, name: str) -> tuple[Annotation, SegmentPlanner, RestoreExecutor]:
         if self._open is None or self._open[0] != name:
             self.close()
             cell = self._cells[name]
@@ -116,19 +117,16 @@ class _Segments:
                 shown = recorded(cell, backend, self._augment.seed)
                 scene = DemonstratedScene(shown, backend.robot, backend.scene)
                 annotation = suggest_annotation(shown, ExactSurroundings(scene))
-                planner = SegmentPlanner(
-                    backend.robot, backend.scene, shown, annotation, self._augment
-                )
-                maker = SegmentMaker(backend, shown, annotation, self._augment)
+                executor = RestoreExecutor(backend, [(shown, annotation)], self._augment)
             except BaseException:
                 backend.close()
                 raise
-            self._open = name, backend, annotation, planner, maker
+            self._open = name, backend, annotation, executor.planner(0), executor
         return self._open[2:]
 
     def __call__(self, item: tuple[str, int]) -> dict[str, Any]:
         name, number = item
-        annotation, planner, make = self._opened(name)
+        annotation, planner, executor = self._opened(name)
         k, at = divmod(number, len(annotation.spheres))
         sphere = annotation.spheres[at]
         started = time.perf_counter()
@@ -159,7 +157,7 @@ class _Segments:
                 "lengthened": motion.duration > self._augment.duration,
                 **asdict(found),
             }
-        attempt = make(at, k)
+        attempt = executor.attempt(AttemptKey(0, at, k))
         row["outcome"] = attempt.outcome
         if attempt.episode is not None and motion is not None:
             proof = attempt.episode.provenance.certificate or {}

@@ -44,7 +44,7 @@ _UNKNOWN = Annotated[
 _TOOL_MARGIN = Annotated[float, arg(help="Distance that stays free of the tool everywhere [m].")]
 _MIN_RADIUS = Annotated[float, arg(help="Smallest sphere worth having [m].")]
 _MAX_RADIUS = Annotated[float, arg(help="Largest sphere [m].")]
-_LAW = Annotated[
+_DISTRIBUTION = Annotated[
     Literal["paper", "area"],
     arg(help="How positions are drawn on a sphere: as the paper says, or uniform over its area."),
 ]
@@ -71,7 +71,7 @@ class Run:
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000
     image_size: _IMAGE = 128
-    law: _LAW = "paper"
+    distribution: _DISTRIBUTION = "paper"
     epochs: Annotated[int | None, arg(help="Training epochs; the policy's own if left out.")] = None
     workers: _WORKERS = 2
     device: _DEVICE = "auto"
@@ -128,7 +128,7 @@ class Play:
 
     Example: sart play demo.h5
 
-    Example: sart play dataset/episodes/sphere00_k00000.h5 --out episode.mp4
+    Example: sart play dataset/episodes/demo00/sphere00_k00000.h5 --out episode.mp4
 
     Example: sart play demo.h5 --camera wrist --out wrist.mp4 --speed 0.5
     """
@@ -218,11 +218,11 @@ class Augment:
 
     Example: sart augment demo.h5 annotation.json --out dataset
 
-    Example: sart augment demo.h5 annotation.json --out dataset --n 100 --law area --workers 2
+    Example: sart augment demo.h5 annotation.json --out dataset --n 100 --workers 2
 
     Example: sart augment demo.h5 annotation.json --out dataset --strategy sart_planned
 
-    An interrupted generation goes on where it was when the same command is typed again.
+    An interrupted generation resumes when the same command is typed again.
     """
 
     demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
@@ -236,11 +236,11 @@ class Augment:
         str,
         arg(help="sart: straight lines; sart_planned: round obstacles where these are blocked."),
     ] = "sart"
-    share: Annotated[
+    allocation: Annotated[
         Literal["radius", "equal"],
         arg(help="How spheres share the trajectories: by their radii, or equally as in the paper."),
     ] = "radius"
-    law: _LAW = "paper"
+    distribution: _DISTRIBUTION = "paper"
     rotation_per_metre: Annotated[
         float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")
     ] = 2.0
@@ -250,7 +250,7 @@ class Augment:
     margin: Annotated[
         float, arg(help="Distance that every segment is proved to keep free [m].")
     ] = 0.0002
-    grasp_play: _GRASP_PLAY = 0.005
+    slip_tolerance: _GRASP_PLAY = 0.005
     seed: _SEED = 0
     workers: _WORKERS = 1
     overwrite: _OVERWRITE = False

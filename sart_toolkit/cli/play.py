@@ -31,7 +31,8 @@ def load_playback(path: Path) -> Playback:
     recording = load_recording(path)
     if isinstance(recording, Demonstration):
         return Playback(path.name, recording)
-    beside = path.resolve().parent.parent / "demo.h5"
+    at = path.resolve().parent
+    beside = at.parent.parent / "sources" / at.name / "demo.h5"
     if not beside.exists():
         raise MissingFile(
             f"{path}: an episode needs the demonstration it was made from, {beside} isn't there; "
@@ -44,7 +45,7 @@ def load_playback(path: Path) -> Playback:
 
 
 def _inside(path: Path) -> str:
-    episodes = sorted((path / "episodes").glob("*.h5"))
+    episodes = sorted(path.glob("episodes/*/*.h5"))
     if episodes:
         return f"name one of its {len(episodes)} episodes, such as {episodes[0]}"
     if (path / "demo.h5").exists():

@@ -55,14 +55,13 @@ from sart_toolkit.cli.arguments import (
 from sart_toolkit.cli.console import progress_bar, say, show
 from sart_toolkit.cli.play import check_play_options, load_playback, play
 from sart_toolkit.cli.teleop import check_hand_options, record_by_hand
-from sart_toolkit.data.records import Dataset, Demonstration, library_versions
+from sart_toolkit.data.dataset import MANIFEST, Dataset, load_dataset
+from sart_toolkit.data.records import Demonstration, library_versions
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.data.storage import (
     check_writable,
     clear_directory,
     load_annotation,
-    load_dataset,
-    load_dataset_info,
     load_demonstration,
     load_recording,
     read_json,
@@ -197,12 +196,12 @@ def augment_verb(args: Augment) -> Result:
     annotation = load_annotation(args.annotation)
     config = AugmentConfig(
         n=args.n,
-        share=args.share,
+        allocation=args.allocation,
         strategy=args.strategy,
-        sampling=SamplingConfig(args.law, args.rotation_per_metre),
+        sampling=SamplingConfig(args.distribution, args.rotation_per_metre),
         duration=args.duration,
         margin=args.margin,
-        grasp_play=args.grasp_play,
+        slip_tolerance=args.slip_tolerance,
         seed=args.seed,
     )
     task = get_task(demonstration.task)
@@ -230,8 +229,7 @@ def augment_verb(args: Augment) -> Result:
 
 def validate_verb(args: Validate) -> Result:
     """`sart validate`."""
-    load_dataset_info(args.dataset)
-    demonstration = load_demonstration(args.dataset / "demo.h5")
+    demonstration = load_dataset(args.dataset).sources[0].demonstration
     task = get_task(demonstration.task)
     with progress_bar("validate", None, "episode") as bar:
 
@@ -325,7 +323,7 @@ def run_whole(args: Run) -> Result:
     """`sart run`: each step unless its result is there already, then the report."""
     # What can't work should be said before anything is written.
     _backend_factory(args.backend, get_task(args.task), args.robot, args.image_size)
-    AugmentConfig(n=args.n, sampling=SamplingConfig(args.law), seed=args.seed)
+    AugmentConfig(n=args.n, sampling=SamplingConfig(args.distribution), seed=args.seed)
     _train_config(args.policy, epochs=args.epochs, seed=args.seed, device=args.device)
     EvaluateConfig(args.episodes, args.eval_seed)
     out = args.out
@@ -361,7 +359,8 @@ def run_whole(args: Run) -> Result:
         ))),
         ("suggest", annotation, lambda: suggest_verb(Suggest(demo, annotation))),
         ("augment", dataset / "dataset.json", lambda: augment_verb(Augment(
-            demo, annotation, dataset, args.n, law=args.law, seed=args.seed, workers=args.workers,
+            demo, annotation, dataset, args.n, distribution=args.distribution, seed=args.seed,
+            workers=args.workers,
         ))),
         ("train", skill / "config.json", lambda: train_verb(Train(
             dataset, skill, args.policy, args.epochs, seed=args.seed, device=args.device
@@ -570,7 +569,7 @@ def info_verb(args: Info) -> Result:
             return {"kind": "run", **state["config"], "stages": state["stages"]}
         if (path / "model.safetensors").exists():
             return {"kind": "skill", **_describe_skill(path)}
-        if (path / "request.json").exists():
+        if (path / MANIFEST).exists():
             return {"kind": "dataset", **_describe_dataset(load_dataset(path))}
         raise BrokenFile(f"{path}: holds no run, skill or dataset; pass another directory")
     if path.suffix == ".json":
@@ -612,8 +611,16 @@ def _describe_demonstration(demonstration: Demonstration) -> Result:
 
 
 def _describe_dataset(dataset: Dataset) -> Result:
-    keys = ("n_trajectories", "n_kept", "n_attempted", "rejections", "seconds", "content_hash")
-    return {"task": dataset.demonstration.task} | {k: dataset.info[k] for k in keys}
+    keys = (
+        "task",
+        "n_trajectories",
+        "n_kept",
+        "n_attempted",
+        "rejections",
+        "seconds",
+        "content_hash",
+    )
+    return {k: dataset.info[k] for k in keys}
 
 
 def _describe_skill(path: Path) -> Result:

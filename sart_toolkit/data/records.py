@@ -255,10 +255,12 @@ class Demonstration:
         )
 
     def content_hash(self) -> str:
-        """SHA-256 over what was shown: steps, commands, task, robot; not states or clock time."""
+        """SHA-256 over what was shown: steps, bodies, commands, task, robot; not saved states."""
         return digest(
             {
                 **self.steps.content(),
+                **{f"body_Ts_world/{name}": Ts for name, Ts in self.body_Ts_world.items()},
+                "timestamps": self.timestamps,
                 "raw_commands": self.raw_commands,
                 "success": self.success,
                 "touching": self.touching,
@@ -337,6 +339,14 @@ class Annotation:
                 f"annotation: waypoints must increase without repeats, got {waypoints}; sort them"
             )
 
+    def content_hash(self) -> str:
+        """SHA-256 over the spheres and the demonstration that they belong to."""
+        spheres = [
+            {**dataclasses.asdict(sphere), "T_world_key": sphere.T_world_key.tolist()}
+            for sphere in self.spheres
+        ]
+        return digest({"demonstration": self.demonstration_hash, "spheres": spheres})
+
     def check_matches(self, demonstration: Demonstration) -> None:
         """Return if the spheres were made for this demonstration.
 
@@ -377,16 +387,21 @@ def convergence_waypoint(demonstration: Demonstration, sphere: PrecisionSphere) 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a generated episode comes from: enough to generate it again."""
+    """Where a generated episode comes from: enough to generate it again.
+
+    `source` is the number of its demonstration in the dataset, `sphere` that of its sphere in that
+    demonstration's annotation, `k` that of the attempt from the sphere.
+    """
 
     demonstration_hash: str
+    source: int
     sphere: int
     k: int
     t_star: int
     T_world_sampled: Array
     seed: int
     strategy: str
-    law: str
+    distribution: str
     certificate: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -436,23 +451,4 @@ class Episode:
         provenance["T_world_sampled"] = self.provenance.T_world_sampled.tolist()
         return digest(
             {**self.steps.content(), "joint_path": self.joint_path, "provenance": provenance}
-        )
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """A demonstration, its annotation, and the episodes generated from them."""
-
-    demonstration: Demonstration
-    annotation: Annotation
-    episodes: tuple[Episode, ...]
-    info: Mapping[str, Any] = field(default_factory=dict)
-
-    def content_hash(self) -> str:
-        """SHA-256 over the demonstration and every episode, in order."""
-        return digest(
-            {
-                "demonstration": self.demonstration.content_hash(),
-                "episodes": [episode.content_hash() for episode in self.episodes],
-            }
         )

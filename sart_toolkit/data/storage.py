@@ -25,7 +25,6 @@ import numpy as np
 from sart_toolkit.data.records import (
     Annotation,
     CameraRecord,
-    Dataset,
     Demonstration,
     Episode,
     PrecisionSphere,
@@ -36,7 +35,6 @@ from sart_toolkit.errors import (
     BrokenFile,
     CannotWrite,
     InvalidInput,
-    Mismatch,
     MissingFile,
     OutputExists,
     SartError,
@@ -135,7 +133,7 @@ def read_json(path: Path) -> dict[str, Any]:
         raise BrokenFile(f"{path}: {error.strerror}; check the path and its permissions") from error
     if not isinstance(value, dict):
         raise BrokenFile(f"{path}: expected a JSON object, got {type(value).__name__}")
-    _check_schema(path, value.pop("schema_version", None))
+    check_schema(path, value.pop("schema_version", None))
     return value
 
 
@@ -189,7 +187,8 @@ class Journal:
             ) from error
         self._file.seek(0)
         content = self._file.read()
-        self._file.truncate(content.rfind(b"\n") + 1)
+        if not content.endswith(b"\n"):
+            self._file.truncate(content.rfind(b"\n") + 1)
         self.rows = read_json_lines(self.path)
 
     def append(self, row: Mapping[str, Any]) -> None:
@@ -274,17 +273,17 @@ def remove(path: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def clear_directory(path: Path, mark: str, overwrite: bool) -> None:
-    """Make room for a directory that a stage writes: an empty one or none at all is left.
+def check_replaceable(path: Path, mark: str, overwrite: bool) -> None:
+    """Return if a stage may write a directory: empty, absent, or one of its own to be replaced.
 
     Args:
         path: the directory.
-        mark: the file that such a directory holds; one without it is never removed.
+        mark: the file that such a directory holds; one without it is never replaced.
         overwrite: whether such a directory may be replaced.
 
     Raises:
         OutputExists: it is there and may not be replaced.
-        CannotWrite: the disk refuses.
+        CannotWrite: its nearest existing parent refuses new files.
     """
     path = Path(path)
     check_writable(path, overwrite)
@@ -294,6 +293,16 @@ def clear_directory(path: Path, mark: str, overwrite: bool) -> None:
         raise OutputExists(
             f"{path}: holds other things (no {mark}), so it won't be replaced; choose another --out"
         )
+
+
+def clear_directory(path: Path, mark: str, overwrite: bool) -> None:
+    """Make room for a directory that a stage writes: an empty one or none at all is left.
+
+    Raises:
+        OutputExists: it is there and may not be replaced, see `check_replaceable`.
+        CannotWrite: the disk refuses.
+    """
+    check_replaceable(path, mark, overwrite)
     remove(path)
 
 
@@ -310,7 +319,12 @@ def _existing(path: Path) -> Path:
     return path
 
 
-def _check_schema(path: Path, version: Any) -> None:
+def check_schema(path: Path, version: Any) -> None:
+    """Return if a file's `schema_version` is the one that this version reads.
+
+    Raises:
+        BrokenFile: it is another.
+    """
     if version != SCHEMA_VERSION:
         raise BrokenFile(
             f"{path}: schema_version is {version!r}, this version reads {SCHEMA_VERSION}; "
@@ -330,7 +344,7 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
             if found != kind:
                 raise BrokenFile(f"{path}: holds {found!r}, expected a {kind}; pass another file")
             version = file.attrs.get("schema_version")
-            _check_schema(path, version.item() if isinstance(version, np.generic) else version)
+            check_schema(path, version.item() if isinstance(version, np.generic) else version)
             yield file
     except InvalidInput as error:
         raise BrokenFile(f"{path}: {error}; restore a copy or make it again") from error
@@ -453,32 +467,39 @@ def load_demonstration(path: Path) -> Demonstration:
     return demonstration
 
 
-def save_episode(path: Path, episode: Episode) -> None:
-    """Write one generated episode to an HDF5 file, whole or not at all.
+def save_episode(path: Path, episode: Episode) -> str:
+    """The content hash of one generated episode, written to an HDF5 file whole or not at all.
 
     Raises:
         CannotWrite: the disk refuses.
     """
     provenance = dataclasses.asdict(episode.provenance)
     provenance["T_world_sampled"] = episode.provenance.T_world_sampled.tolist()
+    content_hash = episode.content_hash()
     with _writing(path, "episode") as file:
         _put_steps(file.create_group("steps"), episode.steps)
         file["joint_path"] = episode.joint_path
         file.attrs["provenance"] = json.dumps(provenance)
-        file.attrs["content_hash"] = episode.content_hash()
+        file.attrs["content_hash"] = content_hash
+    return content_hash
 
 
-def load_episode(path: Path) -> Episode:
+def load_episode(path: Path, content_hash: str | None = None) -> Episode:
     """The episode in an HDF5 file.
+
+    Args:
+        path: the file.
+        content_hash: what the episode's must be, where more is known than the file's own word.
 
     Raises:
         MissingFile: no such file.
-        BrokenFile: truncated or another kind of file.
+        BrokenFile: truncated, another kind of file, or its content doesn't match its hash.
     """
     with _reading(path, "episode") as file:
         provenance = Provenance(**json.loads(file.attrs["provenance"]))
         episode = Episode(_get_steps(file["steps"]), provenance, file["joint_path"][()])
-        if file.attrs["content_hash"] != episode.content_hash():
+        found = episode.content_hash()
+        if found != file.attrs["content_hash"] or content_hash not in (None, found):
             raise BrokenFile(f"{path}: content differs from its hash; generate it again")
         return episode
 
@@ -498,7 +519,7 @@ def load_recording(path: Path) -> Demonstration | Episode:
     return load_episode(path)
 
 
-# --- annotations and datasets -------------------------------------------------------------------
+# --- annotations ---------------------------------------------------------------------------------
 
 _ANNOTATION_NOTE = (
     "Precision spheres: the tool may stray radius_m [m] around its pose at each key waypoint. "
@@ -592,49 +613,3 @@ def load_annotation(path: Path) -> Annotation:
         InvalidInput: a value is out of range.
     """
     return annotation_from_json(read_json(path), Path(path))
-
-
-def episode_name(sphere: int, k: int) -> str:
-    """The file name of the k-th episode generated from a sphere."""
-    return f"sphere{sphere:02d}_k{k:05d}.h5"
-
-
-def load_dataset_info(path: Path) -> dict[str, Any]:
-    """What `dataset.json` says in a directory that `sart augment` made.
-
-    Raises:
-        MissingFile: no such directory, or it holds no dataset.
-        BrokenFile: generation was interrupted (run it again to resume), or the file is damaged.
-    """
-    path = Path(path)
-    if not os.path.isdir(path):
-        raise MissingFile(f"{path}: no such dataset directory; make it with `sart augment`")
-    if not (path / "dataset.json").exists() and (path / "attempts.jsonl").exists():
-        raise BrokenFile(f"{path}: generation was interrupted; run `sart augment` again to resume")
-    return read_json(path / "dataset.json")
-
-
-def load_dataset(path: Path) -> Dataset:
-    """The dataset in a directory that `sart augment` made, whole.
-
-    Raises:
-        MissingFile: a file of the dataset isn't there.
-        BrokenFile: generation was interrupted (run it again to resume), or a file is damaged.
-        Mismatch: the annotation or an episode belongs to another demonstration.
-    """
-    path = Path(path)
-    info = load_dataset_info(path)
-    demonstration = load_demonstration(path / "demo.h5")
-    annotation = load_annotation(path / "annotation.json")
-    annotation.check_matches(demonstration)
-    names = info.get("episodes")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise BrokenFile(f"{path / 'dataset.json'}: lists no episodes; generate again")
-    episodes = tuple(load_episode(path / "episodes" / name) for name in names)
-    for name, episode in zip(names, episodes, strict=True):
-        if episode.provenance.demonstration_hash != annotation.demonstration_hash:
-            raise Mismatch(f"{path}: {name} belongs to another demonstration; generate it again")
-    dataset = Dataset(demonstration, annotation, episodes, info)
-    if info.get("content_hash") != dataset.content_hash():
-        raise BrokenFile(f"{path}: content differs from its hash; generate it again")
-    return dataset

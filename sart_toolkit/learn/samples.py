@@ -19,9 +19,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     CameraRecord,
-    Dataset,
     Demonstration,
     Steps,
     actions_from_commands,
@@ -180,7 +180,7 @@ def open_windows(
         CannotWrite: the disk refuses, or has too little room.
     """
     layout = _layout(dataset, config)
-    key = digest({"dataset": dataset.content_hash(), **dataclasses.asdict(config)})
+    key = digest({"dataset": dataset.content_hash, **dataclasses.asdict(config)})
     frames, samples = Path(directory) / FRAMES, Path(directory) / SAMPLES
     try:
         tensors, about = load_tensors(samples)
@@ -212,7 +212,7 @@ def remove_windows(directory: Path) -> None:
 
 
 def _layout(dataset: Dataset, config: WindowConfig) -> FrameLayout:
-    cameras = dataset.demonstration.steps.cameras
+    cameras = dataset.sources[0].demonstration.steps.cameras
     for camera in config.cameras:
         if camera not in cameras:
             raise unknown_name("camera", camera, cameras)
@@ -231,8 +231,9 @@ def _write(
     progress: Callable[[int, int], None] | None,
 ) -> tuple[dict[str, Tensor], dict[str, object]]:
     """Write the frames' file; the windows' tensors, and what else is to be known of them."""
-    n_trajectories = 1 + len(dataset.episodes)
-    n_steps = len(dataset.demonstration) + sum(len(episode) for episode in dataset.episodes)
+    n_trajectories = len(dataset.sources) + len(dataset)
+    n_steps = sum(len(source.demonstration) for source in dataset.sources)
+    n_steps += sum(entry.steps for entry in dataset.index)
     check_room(path, n_steps * layout.frame_bytes)
 
     back, ahead = np.arange(-config.history + 1, 1), np.arange(config.chunk)
@@ -281,12 +282,13 @@ def _trajectories(
     """
     shown: dict[str, tuple[Demonstration, int, Array]] = {}
     n_yielded = 0
-    for demonstration in (dataset.demonstration,):
+    for source in dataset.sources:
+        demonstration = source.demonstration
         actions = demonstration.actions
         shown[demonstration.content_hash()] = demonstration, n_yielded, actions
         yield demonstration.steps, np.arange(0), actions
         n_yielded += len(demonstration)
-    for i, episode in enumerate(dataset.episodes):
+    for i, episode in enumerate(dataset):
         t_star, sha = episode.provenance.t_star, episode.provenance.demonstration_hash
         if sha not in shown:
             raise Mismatch(f"episode {i} was generated from another demonstration; generate again")

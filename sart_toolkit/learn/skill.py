@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from sart_toolkit.data import storage
+from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     ACTION_SIZE,
     Annotation,
-    Dataset,
     Demonstration,
     Image,
     library_versions,
@@ -279,7 +279,8 @@ def save_skill(
     path = Path(path)
     storage.check_writable(path / "config.json", overwrite)
     storage.remove(path / "config.json")
-    demonstration = dataset.demonstration
+    source = dataset.sources[0]
+    demonstration = source.demonstration
     recorded = {name: demonstration.steps.cameras[name] for name in result.config.cameras}
     config = SkillConfig(
         task=demonstration.task,
@@ -296,7 +297,7 @@ def save_skill(
         training=result.config,
     )
     storage.save_demonstration(path / "demo.h5", demonstration)
-    storage.save_annotation(path / "annotation.json", dataset.annotation)
+    storage.save_annotation(path / "annotation.json", source.annotation)
     storage.write_json(
         path / "training.json",
         {

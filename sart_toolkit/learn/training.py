@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sart_toolkit.data.records import Dataset
+from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
 from sart_toolkit.learn.policies import get_policy

@@ -16,10 +16,10 @@ from typing import Any, TypeVar
 
 import jinja2
 
-from sart_toolkit.data.records import Annotation, Dataset, Demonstration
+from sart_toolkit.data.dataset import load_dataset
+from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.storage import (
     load_annotation,
-    load_dataset,
     load_demonstration,
     read_json,
     write_text,
@@ -90,13 +90,12 @@ def _load_run(directory: Path) -> _Run:
 
     if not directory.is_dir():
         raise MissingFile(f"{directory}: no such directory; pass one that `sart run` wrote")
-    dataset: Dataset | None = None
-    if (directory / "dataset" / "dataset.json").exists():
-        dataset = load_dataset(directory / "dataset")
+    made = (directory / "dataset" / "dataset.json").exists()
+    dataset = load_dataset(directory / "dataset") if made else None
     # Of each episode only its path and what is proved of it are kept.
     paths: list[SegmentPath] = []
     proofs: list[Mapping[str, Any]] = []
-    for episode in dataset.episodes if dataset is not None else ():
+    for episode in dataset if dataset is not None else ():
         paths += segment_paths([episode])
         if episode.provenance.certificate is not None:
             proofs.append(episode.provenance.certificate)

@@ -23,5 +23,5 @@ def annotate(peg_demonstration: Demonstration) -> Callable[..., Annotation]:
 
 @pytest.fixture(scope="session")
 def crowded(annotate: Callable[..., Annotation]) -> Annotation:
-    """Spheres that reach into the block: some tries are kept, some rejected."""
+    """Spheres that reach into the block: some attempts are kept, some rejected."""
     return annotate((15, 0.05), (19, 0.03))

@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.errors import UnknownName
+from sart_toolkit.augment.strategies import SART_PLANNED
+from sart_toolkit.data.sampling import SamplingConfig
+from sart_toolkit.errors import InvalidInput, UnknownName
 
 radii = st.lists(st.floats(0.004, 0.2), min_size=1, max_size=8)
 numbers = st.integers(2, 200)
 
 
-def test_an_unknown_share_is_refused():
-    with pytest.raises(UnknownName, match="share 'radios'.*radius"):
-        AugmentConfig(share="radios")
+def test_an_unknown_allocation_is_refused():
+    with pytest.raises(UnknownName, match="allocation 'radios'.*radius"):
+        AugmentConfig(allocation="radios")
 
 
 @given(radii=radii, n=numbers)
-def test_equal_shares_go_round_robin(radii, n):
+def test_equal_allocation_goes_round_robin(radii, n):
     expected = [len(range(i, n - 1, len(radii))) for i in range(len(radii))]
-    assert AugmentConfig(n, share="equal").quotas(radii) == expected
+    assert AugmentConfig(n, allocation="equal").quotas(radii) == expected
 
 
 @given(radii=radii, n=numbers)
-def test_shares_follow_the_radii(radii, n):
+def test_the_allocation_follows_the_radii(radii, n):
     quotas = AugmentConfig(n).quotas(radii)
     assert sum(quotas) == n - 1
     # Nobody could hand a trajectory on to a sphere that has fewer for its radius.
@@ -38,6 +43,18 @@ def test_shares_follow_the_radii(radii, n):
 def test_more_trajectories_take_none_away(radii, n):
     fewer, more = (AugmentConfig(m).quotas(radii) for m in (n, n + 1))
     assert all(a <= b for a, b in zip(fewer, more, strict=True))
+
+
+def test_demonstrations_count_among_the_trajectories():
+    assert sum(AugmentConfig(40).quotas([0.1, 0.2], demonstrations=3)) == 37
+    with pytest.raises(InvalidInput, match="n: expected more than the 3 demonstrations, got 3"):
+        AugmentConfig(3).quotas([0.1], demonstrations=3)
+
+
+def test_settings_survive_json():
+    config = AugmentConfig(7, "equal", SART_PLANNED, SamplingConfig("area", 1.0), 1.5, seed=3)
+    again = AugmentConfig.from_json(json.loads(json.dumps(config.to_json())))
+    assert again == dataclasses.replace(config, strategy="sart_planned")
 
 
 def test_a_wide_sphere_gets_most():

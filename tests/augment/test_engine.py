@@ -1,31 +1,38 @@
 from __future__ import annotations
 
 import dataclasses
-import json
+import itertools
 import logging
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections import Counter
+from contextlib import closing
 
 import numpy as np
 import pytest
 
 from sart_toolkit.augment import engine
-from sart_toolkit.augment.config import SHARES, AugmentConfig
-from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.executors import KEPT, Attempt, SegmentMaker
+from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration, augment_sources
+from sart_toolkit.augment.executors import Attempt, RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.strategies import STRATEGIES
+from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends.interface import Backend, Capabilities, Contact
+from sart_toolkit.data import writer
+from sart_toolkit.data.dataset import load_dataset
+from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     Annotation,
     PrecisionSphere,
     apply_action,
     convergence_waypoint,
 )
-from sart_toolkit.data.storage import load_dataset
+from sart_toolkit.data.storage import save_annotation, save_demonstration
 from sart_toolkit.errors import (
     CannotWrite,
     InvalidInput,
@@ -36,6 +43,9 @@ from sart_toolkit.errors import (
     UnknownName,
 )
 from sart_toolkit.poses import interpolate, log_rotation, pose
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import record_demonstration
+from sart_toolkit.tasks.task import Placement
 
 CROWDED = AugmentConfig(n=5, seed=3, duration=0.8)
 
@@ -63,15 +73,20 @@ def crowded_dataset(peg_demonstration, crowded, make_peg_backend, tmp_path_facto
 def strategy_dataset(
     request, peg_demonstration, peg_annotation, make_peg_backend, tmp_path_factory
 ):
-    if STRATEGIES[request.param].plans:
+    if request.param == "sart_planned":
         pytest.importorskip("ompl")
     out = tmp_path_factory.mktemp(request.param) / "dataset"
     config = AugmentConfig(n=9, strategy=request.param)
     return augment_demonstration(peg_demonstration, peg_annotation, make_peg_backend, out, config)
 
 
+def n_attempts(path):
+    """How many attempts a dataset's manifest tells of."""
+    return len((path / "manifest.jsonl").read_text().splitlines()) - 1
+
+
 class Interrupt:
-    """A progress callback that interrupts after some tries."""
+    """A progress callback that interrupts after some attempts."""
 
     def __init__(self, after):
         self.calls, self.after = [], after
@@ -87,9 +102,9 @@ class Interrupt:
 
 def test_a_commanded_pose_followed_by_its_action_is_the_next_commanded_pose(strategy_dataset):
     """Through the reversed segment, across the join, and on to the end."""
-    demonstration = strategy_dataset.demonstration
-    assert len(strategy_dataset.episodes) == 8
-    for episode in strategy_dataset.episodes:
+    demonstration = strategy_dataset.sources[0].demonstration
+    assert len(strategy_dataset) == 8
+    for episode in strategy_dataset:
         Ts, gripper = episode.commands(demonstration)
         actions = episode.actions(demonstration)
         assert (
@@ -109,8 +124,8 @@ def test_a_commanded_pose_followed_by_its_action_is_the_next_commanded_pose(stra
 def test_a_segment_is_commanded_along_the_straight_line_from_the_sampled_pose_to_t_star(
     strategy_dataset,
 ):
-    steps = strategy_dataset.demonstration.steps
-    for episode in strategy_dataset.episodes:
+    steps = strategy_dataset.sources[0].demonstration.steps
+    for episode in strategy_dataset:
         goal = steps.commanded_Ts_world_tool[episode.provenance.t_star]
         start = episode.provenance.T_world_sampled
         commanded = episode.steps.commanded_Ts_world_tool
@@ -126,9 +141,9 @@ def test_a_segment_is_commanded_along_the_straight_line_from_the_sampled_pose_to
 
 
 def test_an_episode_says_where_it_comes_from(strategy_dataset, peg_annotation):
-    demonstration = strategy_dataset.demonstration
+    demonstration = strategy_dataset.sources[0].demonstration
     config = strategy_dataset.info["config"]
-    for episode in strategy_dataset.episodes:
+    for episode in strategy_dataset:
         p = episode.provenance
         sphere = peg_annotation.spheres[p.sphere]
         assert p.demonstration_hash == demonstration.content_hash()
@@ -139,18 +154,18 @@ def test_an_episode_says_where_it_comes_from(strategy_dataset, peg_annotation):
 def test_by_the_paper_s_strategy_an_episode_starts_on_its_sphere_and_joins_at_t_star(
     peg_dataset, peg_annotation
 ):
-    for episode in peg_dataset.episodes:
+    for episode in peg_dataset:
         p = episode.provenance
         sphere = peg_annotation.spheres[p.sphere]
         offset = p.T_world_sampled[:3, 3] - sphere.T_world_key[:3, 3]
         assert np.linalg.norm(offset) == pytest.approx(sphere.radius, abs=1e-12)
-        assert p.t_star == convergence_waypoint(peg_dataset.demonstration, sphere)
+        assert p.t_star == convergence_waypoint(peg_dataset.sources[0].demonstration, sphere)
         assert len(episode) == 20, "two seconds at 10 Hz"
 
 
 def test_the_measured_tool_follows_the_commands_and_the_join_is_smooth(strategy_dataset):
-    steps = strategy_dataset.demonstration.steps
-    for episode in strategy_dataset.episodes:
+    steps = strategy_dataset.sources[0].demonstration.steps
+    for episode in strategy_dataset:
         commanded, measured = (
             episode.steps.commanded_Ts_world_tool[:, :3, 3],
             episode.steps.measured_Ts_world_tool[:, :3, 3],
@@ -164,7 +179,7 @@ def test_the_measured_tool_follows_the_commands_and_the_join_is_smooth(strategy_
 def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_the_bit(
     strategy_dataset, peg_backend, peg_annotation
 ):
-    demonstration = strategy_dataset.demonstration
+    demonstration = strategy_dataset.sources[0].demonstration
     planner = SegmentPlanner(
         peg_backend.robot,
         peg_backend.scene,
@@ -172,7 +187,7 @@ def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_
         peg_annotation,
         AugmentConfig(strategy=strategy_dataset.info["config"]["strategy"]),
     )
-    for episode in strategy_dataset.episodes[:4]:
+    for episode in itertools.islice(strategy_dataset, 4):
         t = episode.provenance.t_star
         peg_backend.restore(demonstration.states[t])
         steps = episode.steps
@@ -192,13 +207,15 @@ def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_
             np.testing.assert_array_equal(seen.cameras["wrist"].depth, picture.depth[i])
 
 
-def test_a_try_depends_on_seed_sphere_and_number_alone(
+def test_an_attempt_depends_on_seed_sphere_and_number_alone(
     peg_demonstration, peg_annotation, peg_backend, peg_dataset
 ):
-    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig(n=5))
-    for episode in reversed(peg_dataset.episodes):
+    make = RestoreExecutor(
+        peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig(n=5)
+    ).attempt
+    for episode in reversed(list(peg_dataset)):
         p = episode.provenance
-        again = make(p.sphere, p.k)
+        again = make(AttemptKey(0, p.sphere, p.k))
         assert again.outcome == "kept"
         assert again.episode.content_hash() == episode.content_hash()
 
@@ -206,27 +223,27 @@ def test_a_try_depends_on_seed_sphere_and_number_alone(
 # --- what is kept, rejected and counted ---------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", SHARES)
-def test_every_sphere_gets_its_quota(peg_annotation, augment, tmp_path, share):
-    config = AugmentConfig(n=10, share=share, camera=None)
+@pytest.mark.parametrize("allocation", ALLOCATIONS)
+def test_every_sphere_gets_its_quota(peg_annotation, augment, tmp_path, allocation):
+    config = AugmentConfig(n=10, allocation=allocation, camera=None)
     dataset = augment(peg_annotation, tmp_path / "d", config)
-    made = Counter(episode.provenance.sphere for episode in dataset.episodes)
+    made = Counter(episode.provenance.sphere for episode in dataset)
     spheres = peg_annotation.spheres
     assert [made[i] for i in range(len(spheres))] == config.quotas([s.radius for s in spheres])
 
 
-def test_tries_that_would_touch_are_rejected_and_counted_by_what_touched(crowded_dataset):
+def test_attempts_that_would_touch_are_rejected_and_counted_by_what_touched(crowded_dataset):
     info = crowded_dataset.info
-    assert len(crowded_dataset.episodes) == info["n_kept"] == 4
+    assert len(crowded_dataset) == info["n_kept"] == 4
     assert info["rejections"]["path too close peg / block"] > 0
     for i, row in enumerate(info["by_sphere"]):
-        assert row["kept"] == sum(e.provenance.sphere == i for e in crowded_dataset.episodes)
+        assert row["kept"] == sum(e.provenance.sphere == i for e in crowded_dataset)
     total = sum((Counter(row["rejections"]) for row in info["by_sphere"]), Counter())
     assert total == info["rejections"]
     assert all(isinstance(count, int) for count in info["rejections"].values())
     assert info["n_attempted"] == info["n_kept"] + sum(info["rejections"].values())
     assert info["simulated_seconds"] == pytest.approx(0.8 * info["n_attempted"])
-    assert info["content_hash"] == crowded_dataset.content_hash()
+    assert info["content_hash"] == crowded_dataset.content_hash
 
 
 def test_a_sphere_that_gives_nothing_leaves_fewer_trajectories_and_a_warning(
@@ -236,18 +253,18 @@ def test_a_sphere_that_gives_nothing_leaves_fewer_trajectories_and_a_warning(
         dataset = augment(
             annotate((0, 0.01), (34, 1.5)),
             tmp_path / "d",
-            AugmentConfig(n=3, duration=0.5, share="equal"),
+            AugmentConfig(n=3, duration=0.5, allocation="equal"),
         )
-    assert [episode.provenance.sphere for episode in dataset.episodes] == [0]
+    assert [episode.provenance.sphere for episode in dataset] == [0]
     assert "only 1 of 2 trajectories were kept (" in caplog.text
     assert sum(dataset.info["rejections"].values()) == 20
 
 
-def test_when_every_try_is_rejected_the_error_counts_the_reasons(annotate, augment, tmp_path):
+def test_when_every_attempt_is_rejected_the_error_counts_the_reasons(annotate, augment, tmp_path):
     calls = Interrupt(None)
     for expected in (20, 0):
         with pytest.raises(
-            InvalidInput, match=r"none of 20 tries was kept \(.*out of reach: .*\); use smaller"
+            InvalidInput, match=r"none of 20 attempts was kept \(.*out of reach: .*\); use smaller"
         ):
             augment(annotate((0, 1.5)), tmp_path / "d", AugmentConfig(n=2), progress=calls)
         # The second time the answer is known.
@@ -259,7 +276,7 @@ def test_a_line_too_fast_for_the_joints_takes_longer_and_the_episode_says_so(
     annotate, augment, tmp_path
 ):
     dataset = augment(annotate((0, 0.02)), tmp_path / "d", AugmentConfig(n=3, duration=0.1))
-    for episode in dataset.episodes:
+    for episode in dataset:
         duration = episode.provenance.certificate["duration"]
         assert 0.1 < duration < 1.0
         assert len(episode) == round(10 * duration)
@@ -276,7 +293,9 @@ def test_a_start_in_collision_is_told_with_the_pair_and_by_how_much(
     )
     Ts = shown.steps.measured_Ts_world_tool
     annotation = Annotation((PrecisionSphere(20, Ts[20], 0.01),), shown.content_hash())
-    attempt = SegmentMaker(peg_backend, shown, annotation, AugmentConfig())(0, 0)
+    attempt = RestoreExecutor(peg_backend, [(shown, annotation)], AugmentConfig()).attempt(
+        AttemptKey(0, 0, 0)
+    )
     assert attempt.outcome.startswith("start too close")
     assert re.search(r"start too close .* / block: they overlap by \d+\.\d mm", attempt.detail)
 
@@ -289,8 +308,13 @@ def test_what_touches_in_spite_of_the_proof_ends_the_segment_at_once(
     monkeypatch.setattr(peg_backend, "step", lambda: (steps.append(1), step()))
     bump = [Contact("block", "peg", 1.0, 0.0)]
     monkeypatch.setattr(peg_backend, "contacts", lambda: bump if len(steps) == 7 else [])
-    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
-    assert make(0, 0) == Attempt("contact block / peg", None, "contact block / peg: stopped there")
+    make = RestoreExecutor(
+        peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig()
+    ).attempt
+    key = AttemptKey(0, 0, 0)
+    assert make(key) == Attempt(
+        key, "contact block / peg", None, "contact block / peg: stopped there"
+    )
     assert len(steps) == 7
 
 
@@ -300,8 +324,10 @@ def test_a_backend_that_reports_no_contacts_can_augment(
     blind = dataclasses.replace(peg_backend.capabilities, has_contacts=False)
     monkeypatch.setattr(peg_backend, "capabilities", blind)
     monkeypatch.setattr(peg_backend, "contacts", None)
-    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
-    assert make(0, 0).outcome == KEPT
+    make = RestoreExecutor(
+        peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig()
+    ).attempt
+    assert make(AttemptKey(0, 0, 0)).outcome == KEPT
 
 
 def test_a_segment_on_which_something_else_is_moved_is_rejected(
@@ -322,8 +348,10 @@ def test_a_segment_on_which_something_else_is_moved_is_rejected(
     ]
     scene = dataclasses.replace(peg_backend.scene, bodies=tuple(bodies))
     monkeypatch.setattr(peg_backend, "scene", scene)
-    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
-    assert make(0, 0).outcome == "block was moved"
+    make = RestoreExecutor(
+        peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig()
+    ).attempt
+    assert make(AttemptKey(0, 0, 0)).outcome == "block was moved"
 
 
 def test_a_measured_path_that_is_not_clear_rejects_the_segment(
@@ -337,12 +365,14 @@ def test_a_measured_path_that_is_not_clear_rejects_the_segment(
         return dataclasses.replace(found, joint_path=np.stack([found.q, folded, found.q]))
 
     monkeypatch.setattr(peg_backend, "observe", astray)
-    make = SegmentMaker(peg_backend, peg_demonstration, peg_annotation, AugmentConfig())
-    assert make(0, 0).outcome.startswith("left its path")
+    make = RestoreExecutor(
+        peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig()
+    ).attempt
+    assert make(AttemptKey(0, 0, 0)).outcome.startswith("left its path")
 
 
 def test_an_episode_s_certificates_say_what_is_proved(peg_dataset):
-    for episode in peg_dataset.episodes:
+    for episode in peg_dataset:
         proof = episode.provenance.certificate
         assert proof["duration"] == 2.0
         assert proof["commanded"]["verdict"] == proof["measured"]["verdict"] == "free"
@@ -358,26 +388,26 @@ def test_an_episode_s_certificates_say_what_is_proved(peg_dataset):
 def test_without_body_poses_nothing_can_be_proved(peg_demonstration, peg_annotation, peg_backend):
     blind = dataclasses.replace(peg_demonstration, body_Ts_world={})
     with pytest.raises(Mismatch, match="doesn't tell where 'table' was, .* observes bodies"):
-        SegmentMaker(peg_backend, blind, peg_annotation, AugmentConfig())
+        RestoreExecutor(peg_backend, [(blind, peg_annotation)], AugmentConfig()).planner(0)
 
 
 def test_a_line_faster_than_the_tool_may_lead_is_rejected(
     annotate, peg_demonstration, peg_backend, peg_model
 ):
-    make = SegmentMaker(
-        peg_backend, peg_demonstration, annotate((0, 0.1)), AugmentConfig(duration=0.5)
-    )
-    assert "tool lags behind" in {make(0, k).outcome for k in range(12)}
+    make = RestoreExecutor(
+        peg_backend, [(peg_demonstration, annotate((0, 0.1)))], AugmentConfig(duration=0.5)
+    ).attempt
+    assert "tool lags behind" in {make(AttemptKey(0, 0, k)).outcome for k in range(12)}
 
 
-def test_progress_counts_kept_and_rejected_tries(augment, crowded, crowded_dataset, tmp_path):
+def test_progress_counts_kept_and_rejected_attempts(augment, crowded, crowded_dataset, tmp_path):
     calls = Interrupt(None)
     dataset = augment(crowded, tmp_path / "d", progress=calls)
     assert [kept + rejected for kept, _, rejected in calls.calls] == list(
         range(1, dataset.info["n_attempted"] + 1)
     )
     assert calls.calls[-1] == (4, 4, sum(dataset.info["rejections"].values()))
-    assert dataset.content_hash() == crowded_dataset.content_hash()
+    assert dataset.content_hash == crowded_dataset.content_hash
 
 
 # --- the same bytes -----------------------------------------------------------------------------
@@ -385,14 +415,14 @@ def test_progress_counts_kept_and_rejected_tries(augment, crowded, crowded_datas
 
 def test_two_processes_generate_the_same_as_one(augment, crowded, crowded_dataset, tmp_path):
     dataset = augment(crowded, tmp_path / "d", workers=2)
-    assert dataset.content_hash() == crowded_dataset.content_hash()
+    assert dataset.content_hash == crowded_dataset.content_hash
     assert dataset.info["rejections"] == crowded_dataset.info["rejections"]
     assert dataset.info["n_attempted"] == crowded_dataset.info["n_attempted"]
 
 
 @pytest.fixture(scope="module")
 def interrupted(peg_demonstration, crowded, make_peg_backend, tmp_path_factory):
-    """The directory of `crowded_dataset` as an interruption after its first kept tries left it."""
+    """The directory of `crowded_dataset` as an interruption after a few attempts left it."""
     out = tmp_path_factory.mktemp("interrupted") / "dataset"
 
     def progress(kept, wanted, rejected):
@@ -412,14 +442,13 @@ def test_an_interruption_changes_nothing_that_is_generated(
 ):
     with pytest.raises(KeyboardInterrupt):
         augment(crowded, tmp_path / "d", progress=Interrupt(after))
-    log = (tmp_path / "d" / "attempts.jsonl").read_text().splitlines()
-    assert len(log) == after
+    assert n_attempts(tmp_path / "d") == after
     resumed = Interrupt(None)
     dataset = augment(crowded, tmp_path / "d", progress=resumed)
-    assert dataset.content_hash() == crowded_dataset.content_hash()
+    assert dataset.content_hash == crowded_dataset.content_hash
     assert dataset.info["rejections"] == crowded_dataset.info["rejections"]
     assert len(resumed.calls) == dataset.info["n_attempted"] - after
-    assert load_dataset(tmp_path / "d").content_hash() == dataset.content_hash()
+    assert load_dataset(tmp_path / "d").content_hash == dataset.content_hash
 
 
 def _flip_a_joint_angle(path, episode):
@@ -442,49 +471,90 @@ def test_a_damaged_episode_file_is_made_again_on_resuming(
     augment, crowded, crowded_dataset, interrupted, tmp_path, damage
 ):
     out = shutil.copytree(interrupted, tmp_path / "d")
-    tried = len((out / "attempts.jsonl").read_text().splitlines())
-    path = sorted((out / "episodes").iterdir())[0]
-    names = dict(zip(crowded_dataset.info["episodes"], crowded_dataset.episodes, strict=True))
-    damage(path, names[path.name])
+    attempted = n_attempts(out)
+    path = sorted(out.glob("episodes/*/*.h5"))[0]
+    episodes = dict(zip((e.name for e in crowded_dataset.index), crowded_dataset, strict=True))
+    damage(path, episodes[str(path.relative_to(out))])
     resumed = Interrupt(None)
     dataset = augment(crowded, out, progress=resumed)
-    assert dataset.content_hash() == crowded_dataset.content_hash()
-    assert len(resumed.calls) == dataset.info["n_attempted"] - tried + 1
+    assert dataset.content_hash == crowded_dataset.content_hash
+    assert len(resumed.calls) == dataset.info["n_attempted"] - attempted + 1
 
 
 def test_a_log_whose_last_line_was_cut_is_resumed(
     augment, crowded, crowded_dataset, interrupted, tmp_path
 ):
     out = shutil.copytree(interrupted, tmp_path / "d")
-    log = out / "attempts.jsonl"
+    log = out / "manifest.jsonl"
     log.write_text(log.read_text()[:-9])
-    assert augment(crowded, out).content_hash() == crowded_dataset.content_hash()
-    rows = [json.loads(line) for line in log.read_text().splitlines()]
-    assert len(rows) == crowded_dataset.info["n_attempted"]
+    assert augment(crowded, out).content_hash == crowded_dataset.content_hash
+    assert n_attempts(out) == crowded_dataset.info["n_attempted"]
 
 
-@pytest.mark.parametrize("writer", ["save_demonstration", "save_annotation", "write_json"])
+@pytest.mark.parametrize("write", ["save_demonstration", "save_annotation", "write_json"])
 def test_an_interruption_while_the_directory_is_set_up_can_be_resumed(
-    augment, crowded, crowded_dataset, tmp_path, monkeypatch, writer
+    augment, crowded, crowded_dataset, tmp_path, monkeypatch, write
 ):
     def interrupt(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(engine, writer, interrupt)
+        patched.setattr(writer, write, interrupt)
         augment(crowded, tmp_path / "d")
-    assert augment(crowded, tmp_path / "d").content_hash() == crowded_dataset.content_hash()
+    assert augment(crowded, tmp_path / "d").content_hash == crowded_dataset.content_hash
+
+
+_KILLED = """
+import functools, sys
+from pathlib import Path
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
+from sart_toolkit.backends import make_backend
+from sart_toolkit.data.storage import load_annotation, load_demonstration
+from sart_toolkit.robots import get_robot
+from sart_toolkit.tasks import get_task
+
+path = Path(sys.argv[1])
+task = get_task("peg_in_hole")
+demonstration = load_demonstration(path / "demo.h5")
+size = demonstration.steps.cameras["wrist"].rgb.shape[1]
+make = functools.partial(make_backend, "pybullet", get_robot(task.robot), task.scene, size)
+augment_demonstration(
+    demonstration, load_annotation(path / "annotation.json"), make, path / "d",
+    AugmentConfig(n=5, seed=3, duration=0.8), workers=int(sys.argv[2]),
+    progress=lambda *counts: print(*counts, flush=True),
+)
+"""
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_killed_it_resumes_to_the_same(
+    augment, crowded, crowded_dataset, peg_demonstration, tmp_path, workers
+):
+    save_demonstration(tmp_path / "demo.h5", peg_demonstration)
+    save_annotation(tmp_path / "annotation.json", crowded)
+    for lines in (1, 3):
+        process = subprocess.Popen(
+            [sys.executable, "-c", _KILLED, str(tmp_path), str(workers)],
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        for _ in range(lines):
+            assert process.stdout.readline()
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        assert n_attempts(tmp_path / "d") >= lines
+    dataset = augment(crowded, tmp_path / "d")
+    assert dataset.content_hash == crowded_dataset.content_hash
+    assert [e.content_hash() for e in dataset] == [e.content_hash for e in crowded_dataset.index]
 
 
 _CHAIN = """
 import sys
 import numpy as np
 from pathlib import Path
-from sart_toolkit.augment import engine
-from sart_toolkit.augment.config import SHARES, AugmentConfig
+from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.executors import KEPT, Attempt, SegmentMaker
-from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.backends import make_backend
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
@@ -508,33 +578,118 @@ annotation = suggest_annotation(demonstration, ExactSurroundings(scene))
 config = AugmentConfig(n=5)
 dataset = augment_demonstration(demonstration, annotation, make, Path(sys.argv[1]), config)
 print()
-print(dataset.content_hash())
+print(dataset.content_hash)
 """
 
 
 def test_another_process_generates_the_same_from_the_same_seeds(peg_dataset, tmp_path):
-    size = peg_dataset.demonstration.steps.cameras["wrist"].rgb.shape[1]
+    size = peg_dataset.sources[0].demonstration.steps.cameras["wrist"].rgb.shape[1]
     result = subprocess.run(
         [sys.executable, "-c", _CHAIN, str(tmp_path / "d"), str(size)],
         capture_output=True,
         text=True,
     )
     assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines()[-1] == peg_dataset.content_hash()
+    assert result.stdout.splitlines()[-1] == peg_dataset.content_hash
 
 
 def test_another_seed_generates_something_else(peg_annotation, augment, peg_dataset, tmp_path):
     other = augment(peg_annotation, tmp_path / "d", AugmentConfig(n=5, seed=1))
-    assert other.content_hash() != peg_dataset.content_hash()
+    assert other.content_hash != peg_dataset.content_hash
 
 
-def test_a_finished_dataset_is_returned_without_another_try(
+def test_a_finished_dataset_is_returned_without_another_attempt(
     augment, crowded, crowded_dataset, tmp_path
 ):
     augment(crowded, tmp_path / "d")
     again = augment(crowded, tmp_path / "d", progress=Interrupt(1), workers=2)
-    assert again.content_hash() == crowded_dataset.content_hash()
+    assert again.content_hash == crowded_dataset.content_hash
     assert again.info["seconds"] > 0
+
+
+# --- several demonstrations ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two_sources(peg_task, peg_model, make_peg_backend, peg_demonstration):
+    """Two demonstrations of peg-in-hole, the second with another hand, and a sphere of each."""
+    operator = ScriptedOperator(
+        peg_task.plan(peg_task.initial_state(peg_model, Placement())), np.random.default_rng(7)
+    )
+    with closing(make_peg_backend()) as backend:
+        other = record_demonstration(backend, peg_task, peg_model, operator, seed=7)
+    sources = []
+    for demonstration, radius in ((peg_demonstration, 0.04), (other, 0.02)):
+        sphere = PrecisionSphere(2, demonstration.steps.measured_Ts_world_tool[2], radius)
+        sources.append((demonstration, Annotation((sphere,), demonstration.content_hash())))
+    return sources
+
+
+def test_the_spheres_of_all_demonstrations_share_the_trajectories(
+    two_sources, make_peg_backend, peg_backend, peg_task, tmp_path
+):
+    config = AugmentConfig(n=8, camera=None, duration=1.0)
+    one, two = (
+        augment_sources(two_sources, make_peg_backend, tmp_path / str(workers), config, workers)
+        for workers in (1, 2)
+    )
+    assert one.content_hash == two.content_hash
+    assert [entry.source for entry in one.index].count(0) == 4
+    assert one.info["n_trajectories"] == 8
+    for entry, episode in zip(one.index, one, strict=True):
+        demonstration = one.sources[entry.source].demonstration
+        p = episode.provenance
+        assert p.demonstration_hash == demonstration.content_hash()
+        Ts, _ = episode.commands(demonstration)
+        actions = episode.actions(demonstration)
+        for t in range(len(Ts) - 1):
+            np.testing.assert_allclose(apply_action(Ts[t], actions[t])[0], Ts[t + 1], atol=1e-9)
+    # The same attempts from different demonstrations are drawn apart.
+    firsts = [episode.provenance.T_world_sampled for episode in one][:2]
+    keys = [source.annotation.spheres[0].T_world_key for source in one.sources]
+    directions = [(T - key)[:3, 3] / np.linalg.norm((T - key)[:3, 3])
+                  for T, key in zip(firsts, keys, strict=True)]  # fmt: skip
+    assert directions[0] @ directions[1] < 0.99
+    found = validate_dataset(tmp_path / "1", peg_backend.robot, peg_task.scene)
+    assert found.problems == {} and found.episodes == 6
+
+
+def test_a_demonstration_s_episodes_do_not_depend_on_those_after_it(
+    two_sources, make_peg_backend, tmp_path
+):
+    config = AugmentConfig(n=6, camera=None, duration=1.0, allocation="equal")
+    both = augment_sources(two_sources, make_peg_backend, tmp_path / "both", config)
+    config = dataclasses.replace(config, n=3)
+    alone = augment_sources(two_sources[:1], make_peg_backend, tmp_path / "alone", config)
+    of_first = [entry.content_hash for entry in both.index if entry.source == 0]
+    assert of_first == [entry.content_hash for entry in alone.index]
+
+
+# --- executors ----------------------------------------------------------------------------------
+
+
+class Backwards(RestoreExecutor):
+    """Makes its attempts in an order of its own, which takes one process."""
+
+    parallel = False
+
+    def attempts(self, keys):
+        return map(self.attempt, reversed(list(keys)))
+
+
+def test_an_executor_may_choose_its_order_and_changes_nothing_by_it(
+    augment, crowded, crowded_dataset, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(engine, "get_executor", lambda name: Backwards)
+    with pytest.raises(InvalidInput, match="workers: executor 'restore' needs 1 process, got 2"):
+        augment(crowded, tmp_path / "d", workers=2)
+    assert augment(crowded, tmp_path / "d").content_hash == crowded_dataset.content_hash
+
+
+def test_an_unknown_executor_is_refused_with_the_nearest_name(annotate, augment, tmp_path):
+    with pytest.raises(UnknownName, match="executor 'restroe': did you mean 'restore'"):
+        augment(annotate((0, 0.05)), tmp_path / "d", AugmentConfig(executor="restroe"))
+    assert not (tmp_path / "d").exists()
 
 
 # --- refusals -----------------------------------------------------------------------------------
@@ -552,17 +707,25 @@ def test_a_directory_made_with_other_settings_is_left_alone_unless_overwritten(
         with pytest.raises(KeyboardInterrupt):
             augment(annotation, out, config, progress=Interrupt(1))
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
-    for changed in (
-        lambda: augment(annotation, out, dataclasses.replace(config, n=2)),
-        lambda: augment(annotation, out, dataclasses.replace(config, seed=1)),
-        lambda: augment(annotate((0, 0.031)), out, config),
+    for changed, differing in (
+        (
+            lambda: augment(annotation, out, dataclasses.replace(config, n=2)),
+            r"request.config.n 3, now 2\)",
+        ),
+        (
+            lambda: augment(annotation, out, dataclasses.replace(config, seed=1)),
+            r"request.config.seed 0, now 1\)",
+        ),
+        (lambda: augment(annotate((0, 0.031)), out, config), r"sources.0.annotation .*, now .*\)"),
     ):
-        with pytest.raises(OutputExists, match="made with other settings; add --overwrite"):
+        with pytest.raises(
+            OutputExists, match=rf"made with other settings \({differing}; add --over"
+        ):
             changed()
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
     smaller = augment(annotation, out, dataclasses.replace(config, n=2), overwrite=True)
-    assert len(smaller.episodes) == 1
-    assert len(list((out / "episodes").iterdir())) == 1
+    assert len(smaller) == 1
+    assert len(list(out.glob("episodes/*/*.h5"))) == 1
 
 
 def test_a_directory_with_something_else_in_it_is_left_alone(annotate, augment, tmp_path):
@@ -637,20 +800,32 @@ def test_a_backend_that_lacks_a_capability_is_refused_and_closed(
     def make():
         return Arm(peg_backend.robot, peg_backend.scene)
 
-    with pytest.raises(MissingCapability, match="backend 'arm' can't restore states and render"):
+    with pytest.raises(MissingCapability, match="backend 'arm' can't restore states, which exec"):
         augment_demonstration(
             peg_demonstration, peg_annotation, make, tmp_path / "d", workers=workers
         )
     assert Arm.open == 0
 
 
-def test_a_try_on_a_backend_that_cannot_restore_is_refused(
+def test_an_attempt_on_a_backend_that_cannot_restore_is_refused(
     peg_demonstration, peg_annotation, peg_backend
 ):
     arm = Arm(peg_backend.robot, peg_backend.scene)
     with pytest.raises(MissingCapability, match="can't restore states; use another backend"):
-        SegmentMaker(arm, peg_demonstration, peg_annotation, AugmentConfig())(0, 0)
+        RestoreExecutor(arm, [(peg_demonstration, peg_annotation)], AugmentConfig()).attempt(
+            AttemptKey(0, 0, 0)
+        )
     arm.close()
+
+
+def test_without_rendering_pictures_are_refused_and_their_lack_is_not(
+    annotate, augment, peg_backend, peg_demonstration, monkeypatch
+):
+    blind = dataclasses.replace(peg_backend.capabilities, renders=False)
+    monkeypatch.setattr(peg_backend, "capabilities", blind)
+    RestoreExecutor.check(peg_backend, [peg_demonstration], AugmentConfig(camera=None))
+    with pytest.raises(MissingCapability, match="can't render; augment without pictures, or use"):
+        RestoreExecutor.check(peg_backend, [peg_demonstration], AugmentConfig())
 
 
 @pytest.mark.parametrize("workers", [0, -1])

@@ -1,16 +1,16 @@
 """A demonstration with a grasp: what is grasped counts as the robot's from then on."""
 
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
 
 from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.executors import KEPT, SegmentMaker
+from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import Annotation, PrecisionSphere, convergence_waypoint
 from sart_toolkit.data.storage import load_demonstration, save_demonstration
 from sart_toolkit.errors import InvalidInput
@@ -119,7 +119,7 @@ def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(
 ):
     config = AugmentConfig(n=8)
     i = len(annotation.spheres) - 1
-    attempt = SegmentMaker(backend, shown, annotation, config)(i, 0)
+    attempt = RestoreExecutor(backend, [(shown, annotation)], config).attempt(AttemptKey(0, i, 0))
     assert attempt.outcome == KEPT
     lifted = backend.observe().Ts_world_body["toolbox"][2, 3]
     assert lifted > 0.01
@@ -129,11 +129,11 @@ def test_a_try_with_an_object_in_the_grasp_does_not_depend_on_those_before(
     backend, shown, annotation
 ):
     """Contacts that are there when a state is restored must leave nothing behind."""
-    make = SegmentMaker(backend, shown, annotation, AugmentConfig(n=8))
+    make = RestoreExecutor(backend, [(shown, annotation)], AugmentConfig(n=8)).attempt
     i = len(annotation.spheres) - 1
-    first = make(i, 0)
-    make(i, 1)
-    again = make(i, 0)
+    first = make(AttemptKey(0, i, 0))
+    make(AttemptKey(0, i, 1))
+    again = make(AttemptKey(0, i, 0))
     assert again.outcome == first.outcome == KEPT
     assert again.episode.content_hash() == first.episode.content_hash()
 
@@ -145,7 +145,9 @@ def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
     t = next(s for s in range(len(shown)) if carried_at[s] and height[s] > 0.012)
     config = AugmentConfig(n=8)
     outcomes = {
-        SegmentMaker(backend, shown, sphere_at(shown, t, 0.04), config)(0, k).outcome
+        RestoreExecutor(backend, [(shown, sphere_at(shown, t, 0.04))], config)
+        .attempt(AttemptKey(0, 0, k))
+        .outcome
         for k in range(12)
     }
     assert "path too close toolbox / table" in outcomes
@@ -153,8 +155,8 @@ def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
 
 def test_a_segment_on_which_the_object_slips_is_rejected(backend, shown, annotation):
     i = len(annotation.spheres) - 1
-    config = AugmentConfig(n=8, grasp_play=0.0)
-    attempt = SegmentMaker(backend, shown, annotation, config)(i, 0)
+    config = AugmentConfig(n=8, slip_tolerance=0.0)
+    attempt = RestoreExecutor(backend, [(shown, annotation)], config).attempt(AttemptKey(0, i, 0))
     assert attempt.outcome == "toolbox slipped in the grasp"
     assert attempt.episode is None
 
@@ -165,9 +167,12 @@ def test_a_segment_on_which_the_open_fingers_touch_the_object_is_rejected(
     t = next(s for s in range(len(shown)) if shown.steps.commanded_gripper[s] > 0.5) - 2
     config = AugmentConfig(n=8)
     outcomes = [
-        SegmentMaker(backend, shown, sphere_at(shown, t - 1, 0.003), config)(0, k) for k in range(2)
+        RestoreExecutor(backend, [(shown, sphere_at(shown, t - 1, 0.003))], config).attempt(
+            AttemptKey(0, 0, k)
+        )
+        for k in range(2)
     ]
     assert all(attempt.outcome == KEPT for attempt in outcomes)
     wide = sphere_at(shown, t - 1, 0.06)
-    tries = functools.partial(SegmentMaker(backend, shown, wide, config), 0)
-    assert any("path too close" in tries(k).outcome for k in range(8))
+    make = RestoreExecutor(backend, [(shown, wide)], config).attempt
+    assert any("path too close" in make(AttemptKey(0, 0, k)).outcome for k in range(8))

@@ -17,11 +17,12 @@ from PIL import Image
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.executors import KEPT, SegmentMaker
+from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import make_backend
 from sart_toolkit.collision.certificate import certify
+from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     Annotation,
     PrecisionSphere,
@@ -216,8 +217,10 @@ def test_a_bent_segment_is_executed_proved_as_measured_and_joined(
     backend, demonstration, annotate, straight, planned
 ):
     k = next(k for k in planned if is_kept(planned[k]) and not is_kept(straight[k]))
-    make = SegmentMaker(backend, demonstration, annotate("ball"), config("sart_planned"))
-    attempt = make(0, k)
+    make = RestoreExecutor(
+        backend, [(demonstration, annotate("ball"))], config("sart_planned")
+    ).attempt
+    attempt = make(AttemptKey(0, 0, k))
     assert attempt.outcome == KEPT
     proof = attempt.episode.provenance.certificate
     assert proof["commanded"]["verdict"] == proof["measured"]["verdict"] == "free"
@@ -245,10 +248,10 @@ def test_two_processes_generate_the_same_as_one_and_it_holds_when_checked_again(
         )
         for workers in (1, 2)
     ]
-    assert datasets[0].content_hash() == datasets[1].content_hash()
+    assert datasets[0].content_hash == datasets[1].content_hash
     t_star = convergence_waypoint(demonstration, annotation.spheres[0])
     bent = 0
-    for episode in datasets[0].episodes:
+    for episode in datasets[0]:
         assert episode.provenance.t_star == t_star
         way = episode.steps.commanded_Ts_world_tool[:, :3, 3]
         chord = (way[-1] - way[0]) / np.linalg.norm(way[-1] - way[0])

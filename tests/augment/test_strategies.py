@@ -10,11 +10,25 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.strategies import STRATEGIES, get_strategy, sart, sart_planned
+from sart_toolkit.augment.strategies import (
+    SART,
+    SART_PLANNED,
+    STRATEGIES,
+    Proposal,
+    Strategy,
+    get_strategy,
+    strategy_name,
+)
 from sart_toolkit.data.records import Demonstration, PrecisionSphere, Steps, convergence_waypoint
-from sart_toolkit.data.sampling import LAWS, SamplingConfig, sample_direction, sample_rotation
+from sart_toolkit.data.sampling import (
+    DISTRIBUTIONS,
+    SamplingConfig,
+    sample_direction,
+    sample_rotation,
+)
 from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
 from sart_toolkit.poses import angle_between, log_rotation, pose
+from sart_toolkit.registry import lookup
 
 N = 20_000
 some = settings(max_examples=100, deadline=None, derandomize=True)
@@ -57,29 +71,33 @@ def _demonstration(positions):
     )
 
 
-# --- sampling laws ------------------------------------------------------------------------------
+# --- sampling distributions ---------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=LAWS)
-def law(request):
+@pytest.fixture(scope="module", params=DISTRIBUTIONS)
+def distribution(request):
     return request.param
 
 
 @pytest.fixture(scope="module")
-def directions(law):
+def directions(distribution):
     rng = np.random.default_rng(0)
-    return np.array([sample_direction(rng, law) for _ in range(N)])
+    return np.array([sample_direction(rng, distribution) for _ in range(N)])
 
 
-def test_phi_is_uniform_by_the_paper_s_law_and_its_cosine_by_area(law, directions):
+def test_phi_is_uniform_by_the_paper_s_distribution_and_its_cosine_by_area(
+    distribution, directions
+):
     phi = np.arccos(np.clip(directions[:, 2], -1, 1))
-    assert _fits(phi, stats.uniform(0, np.pi)) == (law == "paper")
-    assert _fits(np.cos(phi), stats.uniform(-1, 2)) == (law == "area")
+    assert _fits(phi, stats.uniform(0, np.pi)) == (distribution == "paper")
+    assert _fits(np.cos(phi), stats.uniform(-1, 2)) == (distribution == "area")
 
 
-def test_the_paper_s_law_draws_a_third_near_the_poles_and_area_an_eighth(law, directions):
+def test_the_paper_s_distribution_draws_a_third_near_the_poles_and_area_an_eighth(
+    distribution, directions
+):
     near_pole = (np.abs(directions[:, 2]) > np.cos(np.deg2rad(30))).mean()
-    expected = {"paper": 1 / 3, "area": 1 - np.cos(np.deg2rad(30))}[law]
+    expected = {"paper": 1 / 3, "area": 1 - np.cos(np.deg2rad(30))}[distribution]
     assert near_pole == pytest.approx(expected, abs=0.01)
 
 
@@ -118,16 +136,18 @@ points = st.tuples(*[st.floats(-1, 1)] * 3)
     turn=points,
     radius=st.floats(0.001, 0.5),
     nu=st.floats(0, 3),
-    law=st.sampled_from(LAWS),
+    distribution=st.sampled_from(DISTRIBUTIONS),
     seed=st.integers(0, 2**32),
 )
 def test_the_sampled_pose_lies_on_the_sphere_turned_by_no_more_than_allowed(
-    centre, turn, radius, nu, law, seed
+    centre, turn, radius, nu, distribution, seed
 ):
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
     sphere = PrecisionSphere(0, pose(centre, turn), radius)
-    config = SamplingConfig(law, nu)
-    drawn = [sart(demonstration, sphere, np.random.default_rng(seed), config) for _ in range(2)]
+    config = SamplingConfig(distribution, nu)
+    drawn = [
+        SART.propose(demonstration, sphere, np.random.default_rng(seed), config) for _ in range(2)
+    ]
     T = drawn[0].T_world_sampled
     np.testing.assert_array_equal(T, drawn[1].T_world_sampled)
     assert np.linalg.norm(T[:3, 3] - sphere.T_world_key[:3, 3]) == pytest.approx(radius, abs=1e-12)
@@ -143,7 +163,7 @@ def test_the_rotation_is_drawn_for_the_radius_of_the_sphere():
         angles = [
             angle_between(
                 np.eye(3),
-                sart(demonstration, sphere, rng, SamplingConfig()).T_world_sampled[:3, :3],
+                SART.propose(demonstration, sphere, rng, SamplingConfig()).T_world_sampled[:3, :3],
             )
             for _ in range(3000)
         ]
@@ -165,7 +185,7 @@ def test_t_star_is_the_first_waypoint_after_the_key_outside_its_sphere(path, rad
         if np.linalg.norm(np.subtract(path[t], path[waypoint])) > radius:
             expected = t
     assert convergence_waypoint(demonstration, sphere) == expected
-    proposal = sart(demonstration, sphere, np.random.default_rng(0), SamplingConfig())
+    proposal = SART.propose(demonstration, sphere, np.random.default_rng(0), SamplingConfig())
     assert proposal.t_star == expected
 
 
@@ -179,10 +199,10 @@ def test_every_strategy_rejoins_ahead_of_its_sphere_and_follows_from_the_rng(
     name, peg_demonstration, peg_annotation
 ):
     # Drawing needs no planner: `get_strategy` would ask for it.
-    strategy = STRATEGIES[name]
+    strategy = lookup("strategy", name, STRATEGIES)
     for sphere in peg_annotation.spheres:
         drawn = [
-            strategy(peg_demonstration, sphere, np.random.default_rng(3), SamplingConfig())
+            strategy.propose(peg_demonstration, sphere, np.random.default_rng(3), SamplingConfig())
             for _ in range(2)
         ]
         assert sphere.waypoint < drawn[0].t_star < len(peg_demonstration)
@@ -194,62 +214,75 @@ def test_every_strategy_rejoins_ahead_of_its_sphere_and_follows_from_the_rng(
 # --- free-space regions -------------------------------------------------------------------------
 
 
-def _distances(region, law, n=3000):
+def _distances(region, distribution, n=3000):
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
     rng = np.random.default_rng(5)
-    drawn = [sart_planned(demonstration, region, rng, SamplingConfig(law)) for _ in range(n)]
+    drawn = [
+        SART_PLANNED.propose(demonstration, region, rng, SamplingConfig(distribution))
+        for _ in range(n)
+    ]
     offsets = np.array([d.T_world_sampled[:3, 3] for d in drawn]) - region.T_world_key[:3, 3]
     turns = [angle_between(region.T_world_key[:3, :3], d.T_world_sampled[:3, :3]) for d in drawn]
     return offsets, np.array(turns)
 
 
-def test_a_pose_in_a_free_space_region_is_drawn_from_its_volume(law):
+def test_a_pose_in_a_free_space_region_is_drawn_from_its_volume(distribution):
     region = PrecisionSphere(0, pose([0.3, 0.1, 0.2], [0.4, 0, 0]), 0.25, kind="free_space")
-    offsets, turns = _distances(region, law)
+    offsets, turns = _distances(region, distribution)
     distances = np.linalg.norm(offsets, axis=1)
     assert _fits((distances / 0.25) ** 3, stats.uniform(0, 1))
     assert _fits(turns, stats.uniform(0, 2.0 * 0.25))
     phi = np.arccos(offsets[:, 2] / distances)
-    assert _fits(phi, stats.uniform(0, np.pi)) == (law == "paper")
+    assert _fits(phi, stats.uniform(0, np.pi)) == (distribution == "paper")
     # By area the volume is filled evenly: an axis-parallel slab's share is its volume's.
     inside = (np.abs(offsets[:, 2]) < 0.05).mean()
     share = 0.5 * (3 * 0.2 - 0.2**3)
-    assert (abs(inside - share) < 0.03) == (law == "area")
+    assert (abs(inside - share) < 0.03) == (distribution == "area")
 
 
 @pytest.mark.parametrize("kind", ["ball", "free_space"])
 def test_the_paper_s_strategy_draws_from_the_surface_of_a_sphere_of_either_kind(kind):
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
     sphere = PrecisionSphere(0, pose([0.1, 0, 0]), 0.25, kind=kind)
-    T = sart(demonstration, sphere, np.random.default_rng(1), SamplingConfig()).T_world_sampled
+    T = SART.propose(
+        demonstration, sphere, np.random.default_rng(1), SamplingConfig()
+    ).T_world_sampled
     assert np.linalg.norm(T[:3, 3] - [0.1, 0, 0]) == pytest.approx(0.25, abs=1e-12)
 
 
-def test_in_a_ball_the_strategy_that_plans_draws_what_the_paper_s_does(law):
+def test_in_a_ball_the_strategy_that_plans_draws_what_the_paper_s_does(distribution):
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
-    sphere, config = PrecisionSphere(0, pose([0.1, 0, 0]), 0.2), SamplingConfig(law)
+    sphere, config = PrecisionSphere(0, pose([0.1, 0, 0]), 0.2), SamplingConfig(distribution)
     for seed in range(5):
         a, b = (
-            f(demonstration, sphere, np.random.default_rng(seed), config)
-            for f in (sart, sart_planned)
+            strategy.propose(demonstration, sphere, np.random.default_rng(seed), config)
+            for strategy in (SART, SART_PLANNED)
         )
         assert a.t_star == b.t_star
         np.testing.assert_array_equal(a.T_world_sampled, b.T_world_sampled)
 
 
-def test_only_the_planned_strategy_plans_and_either_may_be_called():
-    assert {name: strategy.plans for name, strategy in STRATEGIES.items()} == {
-        "sart": False,
-        "sart_planned": True,
-    }
-    demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
-    sphere = PrecisionSphere(0, pose(), 0.2)
-    for strategy in STRATEGIES.values():
-        arguments = demonstration, sphere, np.random.default_rng(0), SamplingConfig()
-        again = demonstration, sphere, np.random.default_rng(0), SamplingConfig()
-        np.testing.assert_array_equal(
-            strategy(*arguments).T_world_sampled, strategy.propose(*again).T_world_sampled
-        )
+def test_only_the_planned_strategy_plans():
+    assert not SART.plans and SART_PLANNED.plans
+
+
+class Still(Strategy):
+    """A strategy from outside: stay at the key pose."""
+
+    def propose(self, demonstration, sphere, rng, config):
+        return Proposal(sphere.waypoint + 1, sphere.T_world_key)
+
+
+def test_a_strategy_of_one_s_own_is_taken_as_it_is():
+    still = Still()
+    assert get_strategy(still) is still
+    assert AugmentConfig(strategy=still).strategy is still
+
+
+def test_a_strategy_is_noted_by_its_name():
+    assert strategy_name("sart") == strategy_name(SART) == "sart"
+    with pytest.raises(InvalidInput, match="Still object .* has no name to note in files"):
+        strategy_name(Still())
 
 
 # --- errors -------------------------------------------------------------------------------------
@@ -261,8 +294,8 @@ def test_an_unknown_strategy_is_refused_with_the_nearest_name():
 
 
 def test_an_unknown_sampling_law_is_refused_with_the_nearest_name():
-    with pytest.raises(UnknownName, match="unknown sampling law 'papers': did you mean 'paper'"):
-        SamplingConfig(law="papers")
+    with pytest.raises(UnknownName, match="sampling distribution 'papers': did you mean 'paper'"):
+        SamplingConfig(distribution="papers")
 
 
 @pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])

@@ -11,8 +11,10 @@ import pytest
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.validate import validate_dataset
+from sart_toolkit.data.dataset import load_dataset
+from sart_toolkit.data.manifest import Manifest
 from sart_toolkit.data.records import Steps
-from sart_toolkit.data.storage import load_dataset, load_episode, save_episode
+from sart_toolkit.data.storage import load_episode, read_json_lines, save_episode
 from sart_toolkit.errors import BrokenFile, Mismatch, MissingFile
 
 
@@ -37,11 +39,17 @@ def validate(peg_model, peg_task):
 
 def change(path, index=0, **changes):
     """Change an episode and write it with hashes that fit."""
+    name = load_dataset(path).index[index].name
+    episode = load_episode(path / name)
+    changed = dataclasses.replace(episode, **changes)
+    save_episode(path / name, changed)
+    manifest = path / "manifest.jsonl"
+    old, new = episode.content_hash(), changed.content_hash()
+    manifest.write_text(manifest.read_text().replace(old, new))
     info = json.loads((path / "dataset.json").read_text())
-    file = path / "episodes" / info["episodes"][index]
-    episode = load_episode(file)
-    save_episode(file, dataclasses.replace(episode, **changes))
-    return file.name, episode
+    info["content_hash"] = Manifest.from_rows(manifest, read_json_lines(manifest)).content_hash()
+    (path / "dataset.json").write_text(json.dumps(info))
+    return name
 
 
 def with_steps(episode, **changes):
@@ -54,7 +62,7 @@ def test_what_was_generated_holds(made, validate):
     found = validate(made, progress=lambda done, wanted: seen.append((done, wanted)))
     assert not found.problems
     assert found.episodes == 3 and seen == [(1, 3), (2, 3), (3, 3)]
-    proofs = [e.provenance.certificate for e in load_dataset(made).episodes]
+    proofs = [e.provenance.certificate for e in load_dataset(made)]
     stated = min(min(p["commanded"]["clearance"], p["measured"]["clearance"]) for p in proofs)
     assert found.least_clearance == pytest.approx(stated, abs=1.1e-5)
     assert found.largest_deviation == pytest.approx(max(p["deviation"] for p in proofs), abs=2e-6)
@@ -63,28 +71,29 @@ def test_what_was_generated_holds(made, validate):
 def test_a_truncated_episode_and_a_missing_one_are_told_and_the_others_still_checked(
     copy, validate
 ):
-    files = sorted((copy / "episodes").iterdir())
-    files[0].write_bytes(files[0].read_bytes()[:3000])
-    files[1].unlink()
+    torn, missing, _ = (entry.name for entry in load_dataset(copy).index)
+    (copy / torn).write_bytes((copy / torn).read_bytes()[:3000])
+    (copy / missing).unlink()
     found = validate(copy)
-    assert set(found.problems) == {files[0].name, files[1].name}
-    assert "truncated or not a episode" in found.problems[files[0].name]
-    assert "no such file" in found.problems[files[1].name]
+    assert set(found.problems) == {torn, missing}
+    assert "truncated or not a episode" in found.problems[torn]
+    assert "no such file" in found.problems[missing]
 
 
 def test_a_flipped_bit_is_told_by_the_hash(copy, validate):
-    file = sorted((copy / "episodes").iterdir())[0]
+    name = load_dataset(copy).index[0].name
+    file = copy / name
     content = bytearray(file.read_bytes())
     at = content.find(load_episode(file).joint_path.tobytes())
     content[at + 800] ^= 1
     file.write_bytes(content)
-    assert "content differs from its hash" in validate(copy).problems[file.name]
+    assert "content differs from its hash" in validate(copy).problems[name]
 
 
-def test_an_episode_exchanged_for_a_good_one_is_told_by_the_dataset_s_hash(copy, validate):
-    files = sorted((copy / "episodes").iterdir())
-    shutil.copy(files[0], files[1])
-    assert "dataset.json" in validate(copy).problems
+def test_an_episode_exchanged_for_a_good_one_is_told_by_the_index(copy, validate):
+    good, exchanged, _ = (entry.name for entry in load_dataset(copy).index)
+    shutil.copy(copy / good, copy / exchanged)
+    assert "content differs from its hash" in validate(copy).problems[exchanged]
 
 
 def provenance(**changes):
@@ -122,10 +131,10 @@ def steps(**changes):
 @pytest.mark.parametrize(
     ("tamper", "message"),
     [
-        (provenance(k=17), "seed, sphere and k lead to another pose"),
-        (provenance(seed=5), "another seed, strategy or law"),
+        (provenance(k=17), "it is of another attempt than the index says"),
+        (provenance(seed=5), "another seed, strategy or distribution"),
         (provenance(t_star=3), "lead to another pose or waypoint"),
-        (provenance(demonstration_hash="0" * 64), "belongs to another demonstration"),
+        (provenance(demonstration_hash="0" * 64), "was generated from another demonstration"),
         (provenance(certificate=None), "certificate: there is none"),
         (certificate("commanded", clearance=0.2), "commanded path is proved .* 200.000 mm are"),
         (certificate("measured", clearance=0.2), "measured path is proved .* 200.000 mm are"),
@@ -141,21 +150,18 @@ def steps(**changes):
     ],
 )
 def test_whatever_is_changed_is_told_though_all_hashes_fit(copy, validate, tamper, message):
-    file = copy / "episodes" / json.loads((copy / "dataset.json").read_text())["episodes"][0]
-    name, _ = change(copy, **tamper(load_episode(file)))
-    # The dataset's own hash no longer fits either: the episode's problem is what is looked for.
+    name = change(copy, **tamper(load_dataset(copy).episode(0)))
     assert re.search(message, validate(copy).problems[name])
 
 
 def test_an_episode_with_a_step_too_few_is_told(copy, validate):
-    info = json.loads((copy / "dataset.json").read_text())
-    episode = load_episode(copy / "episodes" / info["episodes"][0])
+    episode = load_dataset(copy).episode(0)
     shorter = {
         f.name: getattr(episode.steps, f.name)[1:]
         for f in dataclasses.fields(Steps)
         if f.name != "cameras"
     }
-    name, _ = change(copy, steps=Steps(cameras={}, **shorter))
+    name = change(copy, steps=Steps(cameras={}, **shorter))
     assert "reversal: 19 steps, the motion has 20" in validate(copy).problems[name]
 
 
@@ -170,8 +176,9 @@ def test_what_is_no_dataset_is_refused(copy, validate, tmp_path):
 
 
 def test_an_annotation_of_another_demonstration_is_refused(copy, validate):
-    annotation = json.loads((copy / "annotation.json").read_text())
+    path = copy / "sources" / "demo00" / "annotation.json"
+    annotation = json.loads(path.read_text())
     annotation["demonstration_hash"] = "0" * 64
-    (copy / "annotation.json").write_text(json.dumps(annotation))
-    with pytest.raises(Mismatch, match="made for another demonstration"):
+    path.write_text(json.dumps(annotation))
+    with pytest.raises(Mismatch, match="isn't the one that the dataset was made from"):
         validate(copy)

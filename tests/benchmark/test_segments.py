@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.executors import Attempt
+from sart_toolkit.augment.executors import Attempt, RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.benchmark import segments
 from sart_toolkit.benchmark.cells import Cell
@@ -23,6 +23,7 @@ from sart_toolkit.benchmark.segments import (
     tool_off_path,
 )
 from sart_toolkit.cli import main
+from sart_toolkit.data.manifest import AttemptKey
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
 from sart_toolkit.motion import timing
@@ -94,14 +95,13 @@ def test_contacts_and_paths_that_were_left_are_told_apart_from_other_rejections(
 ) -> None:
     outcomes = ["contact peg / block", "left its path peg / block", "peg slipped in the grasp"]
 
-    class Unlucky:
-        def __init__(self, *args: Any) -> None:
-            self.left = iter(outcomes)
+    left = iter(outcomes)
 
-        def __call__(self, sphere: int, k: int) -> Attempt:
-            return Attempt(next(self.left), None)
+    class Unlucky(RestoreExecutor):
+        def attempt(self, key: AttemptKey) -> Attempt:
+            return Attempt(key, next(left), None)
 
-    monkeypatch.setattr(segments, "SegmentMaker", Unlucky)
+    monkeypatch.setattr(segments, "RestoreExecutor", Unlucky)
     result = benchmark_segments([peg_cell], SegmentsConfig(3), tmp_path / "out.json")
     for row in (result["total"], result["cells"][PEG]):
         assert row["rejections"] == dict.fromkeys(outcomes, 1)

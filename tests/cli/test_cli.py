@@ -103,7 +103,7 @@ def test_info_tells_each_kind_of_file(chain: Path, capsys: pytest.CaptureFixture
         "demo.h5": "demonstration",
         "annotation.json": "annotation",
         "data": "dataset",
-        "data/episodes/sphere00_k00000.h5": "episode",
+        "data/episodes/demo00/sphere00_k00000.h5": "episode",
     }
     for name, kind in kinds.items():
         assert run(capsys, "info", chain / name)["kind"] == kind
@@ -139,7 +139,7 @@ def test_validate_proves_a_dataset_again_and_names_what_does_not_hold(
     assert 0 < found["least_clearance_mm"] < 100
     assert 0 < found["largest_deviation_mm"] < 5
     broken = shutil.copytree(chain / "data", tmp_path / "data")
-    episode = sorted((broken / "episodes").iterdir())[0]
+    episode = sorted(broken.glob("episodes/*/*.h5"))[0]
     episode.write_bytes(episode.read_bytes()[:2000])
     capsys.readouterr()
     with pytest.raises(SystemExit) as exit_:

@@ -173,13 +173,16 @@ def test_ctrl_c_while_recording_ends_cleanly_and_leaves_nothing(tmp_path, wait_u
 # --- play ---------------------------------------------------------------------------------------
 
 
+EPISODE = "episodes/demo00/sphere00_k00000.h5"
+
+
 @pytest.fixture
 def dataset(tmp_path, demo, peg_dataset):
     """A dataset's directory as far as `play` looks at it."""
     path = tmp_path / "data"
-    (path / "episodes").mkdir(parents=True)
-    shutil.copy(demo, path / "demo.h5")
-    save_episode(path / "episodes" / "sphere00_k00000.h5", peg_dataset.episodes[0])
+    (path / "sources" / "demo00").mkdir(parents=True)
+    shutil.copy(demo, path / "sources" / "demo00" / "demo.h5")
+    save_episode(path / EPISODE, peg_dataset.episode(0))
     return path
 
 
@@ -199,14 +202,14 @@ def test_a_demonstration_becomes_a_film_of_its_length(demo, tmp_path, capsys):
 def test_an_episode_becomes_a_film_with_the_demonstration_it_joins(dataset, tmp_path, capsys):
     out = tmp_path / "film.mp4"
     said = result(
-        capsys, "play", dataset / "episodes" / "sphere00_k00000.h5", "--out", out,
+        capsys, "play", dataset / EPISODE, "--out", out,
         "--camera", "wrist",
     )  # fmt: skip
     assert said["kind"] == "episode" and frames_of(out)[0] == said["steps"]
 
 
 def test_what_can_t_be_played_is_one_line(demo, dataset, tmp_path, capsys):
-    episode = dataset / "episodes" / "sphere00_k00000.h5"
+    episode = dataset / EPISODE
     torn = tmp_path / "torn.h5"
     torn.write_bytes(demo.read_bytes()[:5000])
     text = tmp_path / "a.json"
@@ -235,8 +238,8 @@ def test_what_can_t_be_played_is_one_line(demo, dataset, tmp_path, capsys):
 
 def test_an_episode_beside_another_demonstration_is_refused(dataset, capsys):
     main(["record", "peg_in_hole", "--seed", "5", "--image-size", "32", "--overwrite", "--out",
-          str(dataset / "demo.h5")])  # fmt: skip
-    episode = dataset / "episodes" / "sphere00_k00000.h5"
+          str(dataset / "sources" / "demo00" / "demo.h5")])  # fmt: skip
+    episode = dataset / EPISODE
     assert "was made from another demonstration" in error(capsys, "play", episode)
 
 

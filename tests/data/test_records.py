@@ -14,7 +14,6 @@ from sart_toolkit.data import records
 from sart_toolkit.data.records import (
     Annotation,
     CameraRecord,
-    Dataset,
     Demonstration,
     Episode,
     PrecisionSphere,
@@ -89,7 +88,15 @@ def make_demonstration(n=6, seed=0):
 def make_episode(demonstration, t_star, n=4, seed=1):
     rng = np.random.default_rng(seed)
     provenance = Provenance(
-        demonstration.content_hash(), 0, 3, t_star, random_walk(1, rng)[0], seed, "sart", "paper"
+        demonstration.content_hash(),
+        0,
+        0,
+        3,
+        t_star,
+        random_walk(1, rng)[0],
+        seed,
+        "sart",
+        "paper",
     )
     return Episode(make_steps(n, rng), provenance)
 
@@ -337,7 +344,7 @@ def test_a_demonstration_that_does_not_fit_together_is_refused(change, message):
 
 def test_a_sampled_pose_that_is_no_pose_is_refused():
     with pytest.raises(InvalidInput, match="T_world_sampled: not a rigid transform"):
-        Provenance("hash", 0, 0, 1, 2 * np.eye(4), 0, "sart", "paper")
+        Provenance("hash", 0, 0, 0, 1, 2 * np.eye(4), 0, "sart", "paper")
 
 
 # --- records keep copies ------------------------------------------------------------------------
@@ -434,15 +441,20 @@ def test_a_demonstrations_hash_follows_every_array_that_was_shown():
             demonstration.steps, cameras={"wrist": dataclasses.replace(camera, **{name: changed})}
         )
         hashes.add(dataclasses.replace(demonstration, steps=steps).content_hash())
+    bodies = demonstration.body_Ts_world
+    assert bodies
     for change in (
         {"raw_commands": demonstration.raw_commands + 1},
         {"success": ~demonstration.success},
         {"task": "run"},
         {"task_parameters": {}},
         {"robot": "another"},
+        {"timestamps": demonstration.timestamps + 0.1},
+        {"body_Ts_world": {k: pose([0.3, 0, 0]) @ Ts for k, Ts in bodies.items()}},
+        {"touching": (*demonstration.touching[:-1], (("a", "b"), ("c", "d"), ("e", "f")))},
     ):
         hashes.add(dataclasses.replace(demonstration, **change).content_hash())
-    assert len(hashes) == 1 + len(shown) + 4 + 5
+    assert len(hashes) == 1 + len(shown) + 4 + 8
 
 
 def test_a_demonstrations_hash_leaves_out_clock_time_and_saved_states():
@@ -463,19 +475,17 @@ def test_an_episodes_hash_follows_its_steps_and_its_provenance():
     assert len(hashes | {episode.content_hash()}) == len(changes) + 1
 
 
-def test_a_datasets_hash_follows_its_demonstration_and_its_episodes_in_order():
+def test_an_annotations_hash_follows_its_spheres_but_not_the_time_spent():
     demonstration = make_demonstration()
     annotation = Annotation((sphere_at(demonstration, 0),), demonstration.content_hash())
-    one, two = (make_episode(demonstration, 3, seed=seed) for seed in (1, 2))
-    datasets = [
-        Dataset(demonstration, annotation, (one, two)),
-        Dataset(demonstration, annotation, (two, one)),
-        Dataset(demonstration, annotation, (one,)),
-        Dataset(make_demonstration(seed=5), annotation, (one, two)),
-    ]
-    assert len({dataset.content_hash() for dataset in datasets}) == len(datasets)
-    again = Dataset(demonstration, annotation, (one, two), {"seconds": 3})
-    assert again.content_hash() == datasets[0].content_hash()
+    (sphere,) = annotation.spheres
+    hashes = {annotation.content_hash()}
+    for change in ({"radius": 0.1}, {"kind": "free_space"}, {"source": "suggested"}):
+        changed = dataclasses.replace(sphere, **change)
+        hashes.add(dataclasses.replace(annotation, spheres=(changed,)).content_hash())
+    hashes.add(dataclasses.replace(annotation, demonstration_hash="x").content_hash())
+    assert len(hashes) == 5
+    assert dataclasses.replace(annotation, seconds=9.0).content_hash() in hashes
 
 
 def test_library_versions_name_what_is_installed_and_skip_what_is_not(monkeypatch):

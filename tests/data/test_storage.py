@@ -21,7 +21,6 @@ from hypothesis import given, settings
 from sart_toolkit.data.records import (
     Annotation,
     CameraRecord,
-    Dataset,
     Demonstration,
     Episode,
     PrecisionSphere,
@@ -37,9 +36,7 @@ from sart_toolkit.data.storage import (
     check_room,
     check_writable,
     clear_directory,
-    episode_name,
     load_annotation,
-    load_dataset,
     load_demonstration,
     load_episode,
     read_json,
@@ -56,7 +53,6 @@ from sart_toolkit.errors import (
     BrokenFile,
     CannotWrite,
     InvalidInput,
-    Mismatch,
     MissingFile,
     OutputExists,
     SartError,
@@ -128,31 +124,17 @@ def make_episode(demonstration, seed=3, certificate=None):
     rng = np.random.default_rng(seed)
     provenance = Provenance(
         demonstration_hash=demonstration.content_hash(),
+        source=0,
         sphere=1,
         k=seed,
         t_star=3,
         T_world_sampled=pose(rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3)),
         seed=5,
         strategy="sart",
-        law="area",
+        distribution="area",
         certificate=certificate,
     )
     return Episode(make_steps(4, rng), provenance)
-
-
-def write_dataset(path, demonstration, annotation, episodes, **info):
-    """A dataset directory as `sart augment` leaves it."""
-    save_demonstration(path / "demo.h5", demonstration)
-    save_annotation(path / "annotation.json", annotation)
-    names = [episode_name(e.provenance.sphere, e.provenance.k) for e in episodes]
-    for name, episode in zip(names, episodes, strict=True):
-        save_episode(path / "episodes" / name, episode)
-    dataset = Dataset(demonstration, annotation, tuple(episodes))
-    write_json(
-        path / "dataset.json",
-        {"episodes": names, "content_hash": dataset.content_hash(), **info},
-    )
-    return dataset
 
 
 def same(a, b):
@@ -237,18 +219,6 @@ def test_a_certificate_of_any_size_is_read_back(tmp_path):
     assert same(load_episode(tmp_path / "episode.h5"), episode)
 
 
-def test_a_dataset_is_read_back_in_the_order_of_its_list(tmp_path):
-    demonstration = make_demonstration()
-    episodes = [make_episode(demonstration, seed) for seed in (7, 3, 5)]
-    dataset = write_dataset(tmp_path, demonstration, make_annotation(demonstration), episodes, n=4)
-    loaded = load_dataset(tmp_path)
-    assert same(loaded.episodes, dataset.episodes)
-    assert same(loaded.demonstration, demonstration)
-    assert same(loaded.annotation, dataset.annotation)
-    assert loaded.info["n"] == 4
-    assert loaded.content_hash() == dataset.content_hash()
-
-
 def test_saving_again_gives_the_same_content(saved, tmp_path):
     save, load, _, path = saved
     again = tmp_path / f"again{path.suffix}"
@@ -291,7 +261,7 @@ def test_a_directory_in_place_of_a_file_is_told(load, tmp_path):
         load(tmp_path)
 
 
-@pytest.mark.parametrize("load", [*LOADERS, load_dataset])
+@pytest.mark.parametrize("load", LOADERS)
 def test_a_name_that_the_disk_does_not_take_is_no_other_error(load, tmp_path):
     with pytest.raises((MissingFile, BrokenFile), match="x{300}"):
         load(tmp_path / ("x" * 300))
@@ -560,72 +530,6 @@ def test_an_annotation_with_any_value_anywhere_works_or_is_refused(field, value)
         json.dumps(written)
 
 
-# --- datasets -----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def dataset_path(tmp_path):
-    demonstration = make_demonstration()
-    episodes = [make_episode(demonstration, seed) for seed in (3, 4)]
-    write_dataset(tmp_path / "dataset", demonstration, make_annotation(demonstration), episodes)
-    return tmp_path / "dataset"
-
-
-def test_a_missing_dataset_is_told(tmp_path):
-    with pytest.raises(MissingFile, match="no such dataset directory; make it with `sart augment`"):
-        load_dataset(tmp_path / "nowhere")
-
-
-def test_a_dataset_whose_generation_was_interrupted_is_told(dataset_path):
-    (dataset_path / "dataset.json").rename(dataset_path / "attempts.jsonl")
-    with pytest.raises(BrokenFile, match="interrupted; run `sart augment` again to resume"):
-        load_dataset(dataset_path)
-
-
-@pytest.mark.parametrize(
-    "name", ["dataset.json", "demo.h5", "annotation.json", "episodes/sphere01_k00003.h5"]
-)
-def test_a_dataset_that_lacks_a_file_is_told(dataset_path, name):
-    (dataset_path / name).unlink()
-    with pytest.raises(MissingFile, match=Path(name).name):
-        load_dataset(dataset_path)
-
-
-def test_a_dataset_that_lists_no_episodes_is_told(dataset_path):
-    write_json(dataset_path / "dataset.json", {"content_hash": "x"})
-    with pytest.raises(BrokenFile, match="dataset.json: lists no episodes; generate again"):
-        load_dataset(dataset_path)
-
-
-@pytest.mark.parametrize("episodes", [5, None, [1], [None], {"a": 1}, "name"])
-def test_a_dataset_whose_list_of_episodes_is_wrong_is_told(dataset_path, episodes):
-    write_json(dataset_path / "dataset.json", {"episodes": episodes, "content_hash": "x"})
-    with pytest.raises((BrokenFile, MissingFile)):
-        load_dataset(dataset_path)
-
-
-def test_a_dataset_with_an_exchanged_episode_is_told_by_its_hash(dataset_path):
-    other = make_episode(make_demonstration(), seed=9)
-    save_episode(dataset_path / "episodes" / "sphere01_k00003.h5", other)
-    with pytest.raises(BrokenFile, match="content differs from its hash; generate it again"):
-        load_dataset(dataset_path)
-
-
-def test_a_dataset_with_the_annotation_of_another_demonstration_is_a_mismatch(dataset_path):
-    other = make_annotation(make_demonstration(seed=2))
-    save_annotation(dataset_path / "annotation.json", other)
-    with pytest.raises(Mismatch, match="annotation was made for another demonstration"):
-        load_dataset(dataset_path)
-
-
-def test_a_dataset_with_an_episode_of_another_demonstration_is_a_mismatch(tmp_path):
-    demonstration = make_demonstration()
-    stranger = make_episode(make_demonstration(seed=2))
-    write_dataset(tmp_path, demonstration, make_annotation(demonstration), [stranger])
-    with pytest.raises(Mismatch, match="demonstration"):
-        load_dataset(tmp_path)
-
-
 # --- writes that fail ---------------------------------------------------------------------------
 
 
@@ -836,12 +740,6 @@ def test_a_file_in_place_of_a_directory_is_never_cleared(tmp_path):
     with pytest.raises((OutputExists, CannotWrite), match="thesis.tex"):
         clear_directory(tmp_path / "thesis.tex", "mark.json", overwrite=True)
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
-
-
-def test_episode_names_sort_as_their_numbers_do():
-    names = [episode_name(s, k) for s in (0, 3, 12) for k in (0, 9, 10, 12345)]
-    assert names == sorted(names)
-    assert len(set(names)) == len(names)
 
 
 def test_lines_are_added_one_by_one_and_a_cut_one_is_left_out(tmp_path):

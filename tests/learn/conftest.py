@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     Annotation,
     CameraRecord,
-    Dataset,
     Demonstration,
     Episode,
     PrecisionSphere,
     Provenance,
     Steps,
 )
+from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.learn.samples import WindowConfig, Windows, open_windows
 from sart_toolkit.learn.training import TrainConfig
 from sart_toolkit.poses import pose
@@ -68,7 +69,7 @@ def make_steps(
 
 
 def make_dataset(
-    t_stars: tuple[int, ...] = (3, 5, 5), n: int = 9, segment: int = 4, seed: int = 0
+    path: Path, t_stars: tuple[int, ...] = (3, 5, 5), n: int = 9, segment: int = 4, seed: int = 0
 ) -> Dataset:
     """A demonstration of `n` steps and an episode that rejoins it at each of `t_stars`."""
     rng = np.random.default_rng(seed)
@@ -93,11 +94,11 @@ def make_dataset(
     episodes = tuple(
         Episode(
             make_steps(segment, rng, demonstration.steps.commanded_Ts_world_tool[t_star]),
-            Provenance(demonstration.content_hash(), 0, k, t_star, key, seed, "sart", "paper"),
+            Provenance(demonstration.content_hash(), 0, 0, k, t_star, key, seed, "sart", "paper"),
         )
         for k, t_star in enumerate(t_stars)
     )
-    return Dataset(demonstration, annotation, episodes)
+    return write_dataset(path, [(demonstration, annotation)], episodes, {})
 
 
 def perturbed(steps: Steps) -> Steps:
@@ -112,24 +113,21 @@ def perturbed(steps: Steps) -> Steps:
     )
 
 
-def with_overview(dataset: Dataset, size: tuple[int, int] = (24, 36)) -> Dataset:
-    """The dataset seen by a second camera with other, rectangular images."""
-
-    def add(steps: Steps) -> Steps:
-        wrist = steps.cameras["wrist"]
-        rgb = np.resize(wrist.rgb, (len(wrist.rgb), *size, 3))
-        overview = CameraRecord(
-            rgb, np.zeros(rgb.shape[:3], np.float32), np.eye(3), pose((0.0, 0.0, 1.0))
-        )
-        return dataclasses.replace(steps, cameras={**steps.cameras, "overview": overview})
-
-    return with_steps(dataset, add)
+def add_overview(steps: Steps, size: tuple[int, int] = (24, 36)) -> Steps:
+    """The steps seen by a second camera with other, rectangular images."""
+    wrist = steps.cameras["wrist"]
+    rgb = np.resize(wrist.rgb, (len(wrist.rgb), *size, 3))
+    overview = CameraRecord(
+        rgb, np.zeros(rgb.shape[:3], np.float32), np.eye(3), pose((0.0, 0.0, 1.0))
+    )
+    return dataclasses.replace(steps, cameras={**steps.cameras, "overview": overview})
 
 
-def with_steps(dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
+def with_steps(path: Path, dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
     """The dataset with all steps changed, and hashes that match again."""
+    (source,) = dataset.sources
     demonstration = dataclasses.replace(
-        dataset.demonstration, steps=change(dataset.demonstration.steps)
+        source.demonstration, steps=change(source.demonstration.steps)
     )
     sha = demonstration.content_hash()
     episodes = tuple(
@@ -137,15 +135,18 @@ def with_steps(dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
             change(episode.steps),
             dataclasses.replace(episode.provenance, demonstration_hash=sha),
         )
-        for episode in dataset.episodes
+        for episode in dataset
     )
-    annotation = dataclasses.replace(dataset.annotation, demonstration_hash=sha)
-    return Dataset(demonstration, annotation, episodes)
+    key = demonstration.steps.measured_Ts_world_tool[0]
+    annotation = Annotation((PrecisionSphere(0, key, 0.05),), sha)
+    return write_dataset(path, [(demonstration, annotation)], episodes, {})
 
 
 @pytest.fixture(name="make_dataset")
-def _make_dataset() -> Callable[..., Dataset]:
-    return make_dataset
+def _make_dataset(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Dataset]:
+    return lambda *args, **options: make_dataset(
+        tmp_path_factory.mktemp("dataset"), *args, **options
+    )
 
 
 @pytest.fixture(name="perturbed")
@@ -154,8 +155,10 @@ def _perturbed() -> Callable[[Steps], Steps]:
 
 
 @pytest.fixture(name="with_steps")
-def _with_steps() -> Callable[[Dataset, Callable[[Steps], Steps]], Dataset]:
-    return with_steps
+def _with_steps(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[Dataset, Callable[[Steps], Steps]], Dataset]:
+    return lambda dataset, change: with_steps(tmp_path_factory.mktemp("dataset"), dataset, change)
 
 
 @pytest.fixture(name="open_windows")
@@ -170,13 +173,14 @@ def _open_windows(tmp_path: Path) -> Callable[..., Windows]:
 
 
 @pytest.fixture
-def dataset() -> Dataset:
-    return make_dataset()
+def dataset(make_dataset: Callable[..., Dataset]) -> Dataset:
+    made: Dataset = make_dataset()
+    return made
 
 
 @pytest.fixture
-def two_cameras(dataset: Dataset) -> Dataset:
-    return with_overview(dataset)
+def two_cameras(dataset: Dataset, tmp_path: Path) -> Dataset:
+    return with_steps(tmp_path / "two_cameras", dataset, add_overview)
 
 
 @pytest.fixture

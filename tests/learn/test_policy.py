@@ -52,7 +52,7 @@ def test_a_policy_of_ones_own_is_trained_saved_loaded_and_run(dataset, config, t
     assert isinstance(result.policy, Linear) and result.final_loss < result.curve[0].loss
     save_skill(tmp_path, result, dataset)
     skill = load_skill(tmp_path)
-    steps = dataset.demonstration.steps
+    steps = dataset.sources[0].demonstration.steps
     image = steps.cameras["wrist"].rgb[0]
     actions = [skill.act({"wrist": image}, 0.5)[:6] for _ in range(_CHUNK)]
     observation = {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sart_toolkit.data.records import Dataset
+from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, UnknownName
 from sart_toolkit.learn.samples import FRAMES, SAMPLES, WindowConfig, open_windows, remove_windows
 from sart_toolkit.poses import pose
@@ -15,11 +15,9 @@ from sart_toolkit.poses import pose
 
 def _expected_windows(dataset, history):
     """Every window of every trajectory, one by one: frames, gripper and action as bytes."""
-    demonstration = dataset.demonstration
+    demonstration = dataset.sources[0].demonstration
     trajectories = [(demonstration.steps, len(demonstration), demonstration.actions)]
-    trajectories += [
-        (e.steps, e.provenance.t_star, e.actions(demonstration)) for e in dataset.episodes
-    ]
+    trajectories += [(e.steps, e.provenance.t_star, e.actions(demonstration)) for e in dataset]
     windows = Counter()
     for steps, t_star, actions in trajectories:
         frames = list(steps.cameras["wrist"].rgb)
@@ -56,7 +54,7 @@ def test_windows_are_exactly_the_steps_of_all_trajectories(
 def test_each_picture_is_stored_once(make_dataset, open_windows):
     dataset = make_dataset((2,) * 20)
     windows = open_windows(dataset)
-    assert len(windows.frames.images["wrist"]) == len(dataset.demonstration) + 20 * 4
+    assert len(windows.frames.images["wrist"]) == len(dataset.sources[0].demonstration) + 20 * 4
 
 
 def test_the_first_window_repeats_the_first_frame(dataset, open_windows):
@@ -275,36 +273,38 @@ def test_an_unknown_camera_is_refused_with_the_nearest(dataset, open_windows):
         open_windows(dataset, cameras=("wirst",))
 
 
-def _with_last(dataset, steps=None, **provenance):
-    last = dataset.episodes[-1]
+def _with_last(path, dataset, steps=None, **provenance):
+    *others, last = dataset
     changed = dataclasses.replace(
         last,
         steps=steps or last.steps,
         provenance=dataclasses.replace(last.provenance, **provenance),
     )
-    return Dataset(dataset.demonstration, dataset.annotation, (*dataset.episodes[:-1], changed))
+    (source,) = dataset.sources
+    sources = [(source.demonstration, source.annotation)]
+    return write_dataset(path, sources, [*others, changed], {})
 
 
-def test_an_episode_of_another_demonstration_is_refused(dataset, open_windows):
+def test_an_episode_of_another_demonstration_is_refused(dataset, open_windows, tmp_path):
     with pytest.raises(Mismatch, match="episode 2 was generated from another demonstration"):
-        open_windows(_with_last(dataset, demonstration_hash="0"))
+        open_windows(_with_last(tmp_path, dataset, demonstration_hash="0"))
 
 
 @pytest.mark.parametrize("t_star", [-1, 9])
-def test_an_episode_that_rejoins_nowhere_is_refused(dataset, t_star, open_windows):
+def test_an_episode_that_rejoins_nowhere_is_refused(dataset, t_star, open_windows, tmp_path):
     with pytest.raises(Mismatch, match=f"episode 2 rejoins at step {t_star} of a demonstration"):
-        open_windows(_with_last(dataset, t_star=t_star))
+        open_windows(_with_last(tmp_path, dataset, t_star=t_star))
 
 
-def test_an_episode_without_the_camera_is_refused(dataset, open_windows):
-    steps = dataclasses.replace(dataset.episodes[-1].steps, cameras={})
+def test_an_episode_without_the_camera_is_refused(dataset, open_windows, tmp_path):
+    steps = dataclasses.replace(dataset.episode(2).steps, cameras={})
     with pytest.raises(Mismatch, match="episode 2 has no images of camera 'wrist'"):
-        open_windows(_with_last(dataset, steps))
+        open_windows(_with_last(tmp_path, dataset, steps))
 
 
 @pytest.mark.parametrize("field", ["intrinsics", "T_tool_camera", "size"])
-def test_an_episode_seen_by_another_camera_is_refused(dataset, field, open_windows):
-    steps = dataset.episodes[-1].steps
+def test_an_episode_seen_by_another_camera_is_refused(dataset, field, open_windows, tmp_path):
+    steps = dataset.episode(2).steps
     camera = steps.cameras["wrist"]
     if field == "size":
         camera = dataclasses.replace(camera, rgb=camera.rgb[:, 2:], depth=camera.depth[:, 2:])
@@ -314,4 +314,4 @@ def test_an_episode_seen_by_another_camera_is_refused(dataset, field, open_windo
         camera = dataclasses.replace(camera, **{field: value})
     steps = dataclasses.replace(steps, cameras={"wrist": camera})
     with pytest.raises(Mismatch, match="episode 2: camera 'wrist' has another size, intrinsics or"):
-        open_windows(_with_last(dataset, steps))
+        open_windows(_with_last(tmp_path, dataset, steps))

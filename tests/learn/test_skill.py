@@ -59,7 +59,7 @@ def test_a_skill_acts_as_the_policy_did_in_training(
     skill = load_skill(tmp_path)
     assert skill.cameras == cameras
     windows = open_windows(two_cameras, cameras=cameras)
-    steps = two_cameras.demonstration.steps
+    steps = two_cameras.sources[0].demonstration.steps
     for _ in range(2):
         skill.reset()
         for t in range(len(steps)):
@@ -75,7 +75,7 @@ def test_a_skill_acts_as_the_policy_did_in_training(
 
 @pytest.mark.parametrize("few", [True, False])
 def test_the_gripper_is_commanded_as_was_shown_unless_that_was_much(trained, dataset, few):
-    demonstration = dataset.demonstration
+    demonstration = dataset.sources[0].demonstration
     shown = np.linspace(0, 0.8, 3 if few else len(demonstration.steps))
     commands = np.resize(shown, len(demonstration.steps))
     steps = dataclasses.replace(demonstration.steps, commanded_gripper=commands)
@@ -176,8 +176,8 @@ def test_a_skill_takes_images_of_any_size(trained):
 
 def test_a_skill_says_where_it_came_from(trained, dataset):
     skill = load_skill(trained[0])
-    assert skill.demonstration.content_hash() == dataset.demonstration.content_hash()
-    assert skill.annotation.demonstration_hash == dataset.annotation.demonstration_hash
+    assert skill.demonstration.content_hash() == dataset.sources[0].demonstration.content_hash()
+    assert skill.annotation.demonstration_hash == dataset.sources[0].annotation.demonstration_hash
     config = skill.config
     assert (config.task, config.robot, config.backend) == ("blob", "none", "synthetic")
     assert list(config.cameras) == ["wrist"] and config.cameras["wrist"].size == (32, 32)

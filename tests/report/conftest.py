@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from sart_toolkit.data import storage
+from sart_toolkit.data.dataset import Dataset
+from sart_toolkit.data.manifest import AttemptKey, Rejection
 from sart_toolkit.data.records import (
     Annotation,
     CameraRecord,
-    Dataset,
     Demonstration,
     Episode,
     Image,
@@ -23,6 +24,7 @@ from sart_toolkit.data.records import (
     Provenance,
     Steps,
 )
+from sart_toolkit.data.writer import DatasetWriter
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.report.video import caption, write_video
 
@@ -67,7 +69,7 @@ def make_steps(p_world_tool: Array, size: int = 48) -> Steps:
     )
 
 
-def make_dataset(task: str = "peg_in_hole", n_episodes: int = 12) -> Dataset:
+def make_dataset(path: Path, task: str = "peg_in_hole", n_episodes: int = 12) -> Dataset:
     """A demonstration of 41 steps, three spheres, and straight segments round-robin over them."""
     rng = np.random.default_rng(0)
     s = np.linspace(0, 1, 41)
@@ -116,34 +118,25 @@ def make_dataset(task: str = "peg_in_hole", n_episodes: int = 12) -> Dataset:
             "deviation": 0.000401 - 0.00001 * k,
         }
         provenance = Provenance(
-            demonstration.content_hash(), i, k // 3, t_star, pose(sampled), 0, "sart", "paper",
+            demonstration.content_hash(),
+            0,
+            i,
+            k // 3,
+            t_star,
+            pose(sampled),
+            0,
+            "sart",
+            "paper",
             certificate,
-        )  # fmt: skip
+        )
         episodes.append(Episode(make_steps(line, 16), provenance))
-    return Dataset(demonstration, annotation, tuple(episodes))
-
-
-def save_dataset(path: Path, dataset: Dataset) -> None:
-    """Write what `sart augment` leaves."""
-    storage.save_demonstration(path / "demo.h5", dataset.demonstration)
-    storage.save_annotation(path / "annotation.json", dataset.annotation)
-    names = []
-    for episode in dataset.episodes:
-        names.append(storage.episode_name(episode.provenance.sphere, episode.provenance.k))
-        storage.save_episode(path / "episodes" / names[-1], episode)
-    storage.write_json(
-        path / "dataset.json",
-        {
-            "episodes": names,
-            "n_kept": len(names),
-            "n_attempted": len(names) + 3,
-            "rejections": {"path too close peg / block": 2, "joint jump": 1},
-            "least_clearance_m": 0.00125,
-            "content_hash": dataset.content_hash(),
-            "config": {"strategy": "sart", "law": "paper", "n": len(names) + 1, "delta": 2.0},
-            "seconds": 9.6,
-        },
-    )
+    with DatasetWriter(path, [(demonstration, annotation)], {}) as writer:
+        for episode in episodes:
+            writer.keep(writer.files.write(episode))
+        reasons = ["path too close peg / block"] * 2 + ["joint jump"]
+        for k, reason in enumerate(reasons, n_episodes):
+            writer.reject(AttemptKey(0, 0, k), Rejection(reason, ""))
+        return writer.finish({"config": {"strategy": "sart", "n": n_episodes + 1}, "seconds": 9.6})
 
 
 def make_evaluation(n: int = 20, task: str = "peg_in_hole") -> dict[str, Any]:
@@ -191,10 +184,9 @@ def make_evaluation(n: int = 20, task: str = "peg_in_hole") -> dict[str, Any]:
 
 def make_run(path: Path) -> Path:
     """A run directory as `sart run peg_in_hole --out path` leaves it, without its report."""
-    dataset = make_dataset()
-    save_dataset(path / "dataset", dataset)
-    storage.save_demonstration(path / "demo.h5", dataset.demonstration)
-    storage.save_annotation(path / "annotation.json", dataset.annotation)
+    (source,) = make_dataset(path / "dataset").sources
+    storage.save_demonstration(path / "demo.h5", source.demonstration)
+    storage.save_annotation(path / "annotation.json", source.annotation)
     epochs = range(1, 13)
     storage.write_json(
         path / "skill" / "training.json",
@@ -206,7 +198,7 @@ def make_run(path: Path) -> Path:
     )
     storage.write_json(path / "evaluation.json", make_evaluation())
     for outcome, episode in (("success", 0), ("failure", 6)):
-        pictures = wrist_pictures(dataset.demonstration.steps.measured_Ts_world_tool[:, :3, 3], 120)
+        pictures = wrist_pictures(source.demonstration.steps.measured_Ts_world_tool[:, :3, 3], 120)
         frames = (
             caption(picture, episode, t / 10, outcome)  # type: ignore[arg-type]
             for t, picture in enumerate(pictures[:8])
@@ -223,7 +215,11 @@ def make_run(path: Path) -> Path:
                 "evaluate": 61.5,
             },
             "command": "sart run peg_in_hole --out run",
-            "config": {"task": "peg_in_hole", "seed": 0, "augment": {"n": 40, "law": "paper"}},
+            "config": {
+                "task": "peg_in_hole",
+                "seed": 0,
+                "augment": {"n": 40, "distribution": "paper"},
+            },
             "versions": {"sart_toolkit": "0.1.0", "python": "3.11.7", "torch": "2.13.0"},
             "machine": {"cores": 2, "memory_gib": 24},
         },
@@ -232,13 +228,13 @@ def make_run(path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def dataset() -> Dataset:
-    return make_dataset()
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return make_dataset(tmp_path_factory.mktemp("dataset"))
 
 
 @pytest.fixture(scope="session")
 def demonstration(dataset: Dataset) -> Demonstration:
-    return dataset.demonstration
+    return dataset.sources[0].demonstration
 
 
 @pytest.fixture(scope="session")
@@ -250,12 +246,6 @@ def _finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run_dir(_finished_run: Path, tmp_path: Path) -> Path:
     """A run directory of the test's own."""
     return Path(shutil.copytree(_finished_run, tmp_path / "run"))
-
-
-@pytest.fixture
-def write_dataset() -> Callable[[Path, Dataset], None]:
-    """Writes what `sart augment` leaves."""
-    return save_dataset
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from sart_toolkit.data.records import Annotation, Dataset, Demonstration, Image
+from sart_toolkit.data.dataset import Dataset
+from sart_toolkit.data.records import Annotation, Demonstration, Image
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.report.figures import (
     SPHERE_COLOURS,
@@ -68,14 +69,14 @@ def test_film_strip_refuses(
 
 
 def test_segment_paths_are_measured_or_commanded_positions(dataset: Dataset) -> None:
-    measured = segment_paths(dataset.episodes)
-    commanded = segment_paths(iter(dataset.episodes), "commanded")
-    assert [path.sphere for path in measured] == [e.provenance.sphere for e in dataset.episodes]
-    for episode, m, c in zip(dataset.episodes, measured, commanded, strict=True):
+    measured = segment_paths(dataset)
+    commanded = segment_paths(iter(dataset), "commanded")
+    assert [path.sphere for path in measured] == [e.provenance.sphere for e in dataset]
+    for episode, m, c in zip(dataset, measured, commanded, strict=True):
         assert (m.positions == episode.steps.measured_Ts_world_tool[:, :3, 3]).all()
         assert (c.positions == episode.steps.commanded_Ts_world_tool[:, :3, 3]).all()
     with pytest.raises(InvalidInput, match="which: expected 'measured' or 'commanded', got 'both'"):
-        segment_paths(dataset.episodes, "both")  # type: ignore[arg-type]
+        segment_paths(dataset, "both")  # type: ignore[arg-type]
 
 
 def test_segment_path_is_checked_and_read_only() -> None:
@@ -88,9 +89,12 @@ def test_segment_path_is_checked_and_read_only() -> None:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_scene_shows_every_sphere_in_its_colour(dataset: Dataset, theme: Any) -> None:
     png = scene_picture(
-        dataset.demonstration, dataset.annotation, segment_paths(dataset.episodes), theme
+        dataset.sources[0].demonstration,
+        dataset.sources[0].annotation,
+        segment_paths(dataset),
+        theme,
     )
-    for i in range(len(dataset.annotation.spheres)):
+    for i in range(len(dataset.sources[0].annotation.spheres)):
         assert shows(png, sphere_colour(i))
     paper = pixels(png)[0, 0]
     assert (paper > 200).all() if theme == "light" else (paper < 60).all()
@@ -98,9 +102,9 @@ def test_scene_shows_every_sphere_in_its_colour(dataset: Dataset, theme: Any) ->
 
 def test_scene_is_as_wide_as_high_for_a_sphere(dataset: Dataset) -> None:
     # Equal aspect: the outline of a sphere alone is a circle.
-    sphere = dataclasses.replace(dataset.annotation.spheres[1], radius=0.15)
-    alone = Annotation((sphere,), dataset.annotation.demonstration_hash)
-    picture = pixels(scene_picture(dataset.demonstration, alone))
+    sphere = dataclasses.replace(dataset.sources[0].annotation.spheres[1], radius=0.15)
+    alone = Annotation((sphere,), dataset.sources[0].annotation.demonstration_hash)
+    picture = pixels(scene_picture(dataset.sources[0].demonstration, alone))
     left = picture[:, : picture.shape[1] // 2].astype(int)
     tinted = left[: int(0.8 * len(left)), :, 2] - left[: int(0.8 * len(left)), :, 0] > 25
     height, width = (int(np.ptp(np.flatnonzero(tinted.any(axis=axis)))) for axis in (1, 0))
@@ -113,10 +117,10 @@ def test_scene_needs_neither_spheres_nor_paths(demonstration: Demonstration) -> 
 
 
 def test_scene_shows_spheres_too_small_for_the_whole_close_up(dataset: Dataset) -> None:
-    first, *others = dataset.annotation.spheres
+    first, *others = dataset.sources[0].annotation.spheres
     small = [dataclasses.replace(sphere, radius=0.004) for sphere in others]
-    annotation = Annotation((first, *small), dataset.annotation.demonstration_hash)
-    png = scene_picture(dataset.demonstration, annotation, segment_paths(dataset.episodes))
+    annotation = Annotation((first, *small), dataset.sources[0].annotation.demonstration_hash)
+    png = scene_picture(dataset.sources[0].demonstration, annotation, segment_paths(dataset))
     half = pixels(png)[:, pixels(png).shape[1] // 2 :].astype(int)
     # Bluish green: the third sphere's tinted disc is large although its radius is 4 mm.
     greenish = (half[..., 1] - half[..., 0] > 20) & (half[..., 1] - half[..., 2] > 5)
@@ -125,7 +129,11 @@ def test_scene_shows_spheres_too_small_for_the_whole_close_up(dataset: Dataset) 
 
 def test_scene_refuses_paths_of_another_annotation(dataset: Dataset) -> None:
     with pytest.raises(InvalidInput, match="belongs to sphere 7, the annotation has 3"):
-        scene_picture(dataset.demonstration, dataset.annotation, [SegmentPath(7, np.zeros((2, 3)))])
+        scene_picture(
+            dataset.sources[0].demonstration,
+            dataset.sources[0].annotation,
+            [SegmentPath(7, np.zeros((2, 3)))],
+        )
 
 
 def test_sphere_colours_repeat_after_the_palette() -> None:

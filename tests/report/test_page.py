@@ -145,9 +145,7 @@ def test_page_tells_the_figures(page: Page) -> None:
         assert words in page.text
 
 
-def test_claims_of_clearance_are_the_episodes_own(
-    run_dir: Path, dataset: Dataset, write_dataset: Callable[[Path, Dataset], None]
-) -> None:
+def test_claims_of_clearance_are_the_episodes_own(run_dir: Path, dataset: Dataset) -> None:
     proof = {"commanded": {"clearance": 0.004}, "measured": {"clearance": 0.003}, "deviation": 2e-4}
     episodes = [
         dataclasses.replace(
@@ -156,10 +154,12 @@ def test_claims_of_clearance_are_the_episodes_own(
                 episode.provenance, certificate=proof if k < 5 else None
             ),
         )
-        for k, episode in enumerate(dataset.episodes)
+        for k, episode in enumerate(dataset)
     ]
     shutil.rmtree(run_dir / "dataset")
-    write_dataset(run_dir / "dataset", dataclasses.replace(dataset, episodes=tuple(episodes)))
+    (source,) = dataset.sources
+    whole = [(source.demonstration, source.annotation)]
+    write_dataset(run_dir / "dataset", whole, episodes, dataset.info)
     text = written(run_dir).text
     assert "The commanded path of 5 of them was proved clear" in text
     assert "by at least 4.00 mm" in text and "by at least 3.00 mm" in text

@@ -30,7 +30,7 @@ def demonstration(peg_demonstration):
 
 @pytest.fixture
 def episode(peg_dataset):
-    return Playback("episode.h5", peg_dataset.demonstration, peg_dataset.episodes[0])
+    return Playback("episode.h5", peg_dataset.sources[0].demonstration, peg_dataset.episode(0))
 
 
 def test_a_demonstration_is_played_from_its_first_step_to_its_last(
@@ -49,7 +49,7 @@ def test_a_demonstration_is_played_from_its_first_step_to_its_last(
 def test_an_episode_is_its_segment_and_then_the_demonstration_from_where_it_joins(
     episode, peg_dataset
 ):
-    made, shown = peg_dataset.episodes[0], peg_dataset.demonstration
+    made, shown = peg_dataset.episode(0), peg_dataset.sources[0].demonstration
     t_star = made.provenance.t_star
     n = len(made)
     assert len(episode) == n + len(shown) - t_star and episode.split == n
@@ -76,7 +76,7 @@ def test_the_scene_is_drawn_with_the_robot_where_it_was(demonstration, peg_backe
 def test_a_segment_s_robot_is_where_its_joints_were(episode, peg_backend, peg_dataset):
     scene = SceneView(episode, peg_backend, "overview")
     scene.picture(0, 32)
-    measured = peg_dataset.episodes[0].steps.measured_Ts_world_tool[0]
+    measured = peg_dataset.episode(0).steps.measured_Ts_world_tool[0]
     np.testing.assert_allclose(peg_backend.observe().T_world_tool, measured, atol=1e-6)
 
 
@@ -92,7 +92,7 @@ def test_what_is_carried_moves_with_the_tool_in_a_segment(tmp_path):
     carried = [t for t, phase in enumerate(scene.phases) if phase.carried]
     spheres = suggest_annotation(shown, ExactSurroundings(scene), [carried[len(carried) // 2]])
     made = augment_demonstration(shown, spheres, make, tmp_path / "d", AugmentConfig(n=2))
-    playback = Playback("episode.h5", shown, made.episodes[0])
+    playback = Playback("episode.h5", shown, made.episode(0))
     SceneView(playback, backend, "overview").picture(0, 32)
     now = backend.observe()
     t = playback.waypoint(0)

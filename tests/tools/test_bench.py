@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from sart_toolkit.errors import SartError
+
 _PATH = Path(__file__).parents[2] / "tools" / "bench.py"
 _SPEC = importlib.util.spec_from_file_location("bench", _PATH)
 assert _SPEC is not None and _SPEC.loader is not None
@@ -57,6 +59,20 @@ def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
     tries_per_second = figures["attempted"] * figures["kept_trajectories_per_second"]
     assert figures["simulated_over_wall"] == pytest.approx(2 * tries_per_second)
     assert "turn 1/1" in err
+
+
+def test_the_dataset_benchmark_measures_programs_of_their_own(capsys):
+    assert bench.main(["dataset", "--episodes", "3", "--n", "2", "3", "--image-size", "16"]) == 0
+    figures = json.loads(capsys.readouterr().out.splitlines()[-1])["figures"]
+    assert figures["open"]["episodes"] == figures["episodes"] == 3
+    assert 0 < figures["open"]["seconds"] < figures["info"]["seconds"]
+    assert figures["open"]["peak_mb"] > 0 and figures["size_mb"] > 0
+    assert {n: row["kept"] for n, row in figures["augment"].items()} == {"2": 1, "3": 2}
+
+
+def test_a_measured_program_that_fails_is_told():
+    with pytest.raises(SartError, match="a measured program failed: ValueError: so"):
+        bench._measured("raise ValueError('so')")
 
 
 def test_the_certificate_benchmark_counts_verdicts_and_what_they_miss(capsys):

@@ -1,0 +1,171 @@
+"""The manifest of a dataset: what it was asked for, and how each attempt ended.
+
+A file of JSON lines that only grows. The first says what was asked for and of which demonstrations;
+each further one how an attempt ended. Where two tell of one attempt the later counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sart_toolkit.data.records import digest
+from sart_toolkit.data.storage import SCHEMA_VERSION, check_schema
+from sart_toolkit.errors import BrokenFile
+
+KEPT = "kept"
+
+
+class AttemptKey(NamedTuple):
+    """The k-th attempt from a sphere of a source: the numbers that decide all that is random."""
+
+    source: int
+    sphere: int
+    k: int
+
+
+@dataclass(frozen=True)
+class EpisodeEntry:
+    """A kept episode in a dataset's index.
+
+    `steps`: of its segment; `clearance` [m]: what the certificate of its commanded path proves,
+    `None` without one.
+    """
+
+    source: int
+    sphere: int
+    k: int
+    steps: int
+    content_hash: str
+    clearance: float | None = None
+
+    @property
+    def key(self) -> AttemptKey:
+        """The attempt that gave the episode."""
+        return AttemptKey(self.source, self.sphere, self.k)
+
+    @property
+    def name(self) -> str:
+        """The episode's file in the dataset directory."""
+        return episode_name(self.key)
+
+
+class Rejection(NamedTuple):
+    """Why an attempt gave no episode: `outcome` is the same for all that fail alike."""
+
+    outcome: str
+    detail: str
+
+
+def source_name(source: int) -> str:
+    """The folder of a dataset's demonstration, by its number."""
+    return f"demo{source:02d}"
+
+
+def episode_name(key: AttemptKey) -> str:
+    """The file of an attempt's episode in a dataset directory."""
+    return f"episodes/{source_name(key.source)}/sphere{key.sphere:02d}_k{key.k:05d}.h5"
+
+
+@dataclass
+class Manifest:
+    """What a dataset was asked for, and how its attempts ended.
+
+    `sources` has for each demonstration its content hash and its annotation's; `request` is
+    whatever else decides what is generated.
+    """
+
+    sources: tuple[tuple[str, str], ...]
+    request: Mapping[str, Any]
+    kept: dict[AttemptKey, EpisodeEntry] = field(default_factory=dict)
+    rejected: dict[AttemptKey, Rejection] = field(default_factory=dict)
+
+    @classmethod
+    def from_rows(cls, path: Path, rows: Iterable[Mapping[str, Any]]) -> Manifest:
+        """The manifest in the rows of the file `path`.
+
+        Raises:
+            BrokenFile: a schema that this version doesn't know, or a field is missing or wrong.
+        """
+        head, *attempts = rows or [{}]
+        check_schema(path, head.get("schema_version"))
+        try:
+            manifest = cls(
+                tuple(
+                    (str(row["demonstration"]), str(row["annotation"])) for row in head["sources"]
+                ),
+                dict(head["request"]),
+            )
+            for row in attempts:
+                manifest.add(row)
+        except (KeyError, TypeError, ValueError) as error:
+            raise BrokenFile(
+                f"{path}: {error!r}: a field is missing or wrong; restore a copy or generate again"
+            ) from error
+        return manifest
+
+    def head(self) -> dict[str, Any]:
+        """The manifest's first row."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "sources": [
+                {"demonstration": demonstration, "annotation": annotation}
+                for demonstration, annotation in self.sources
+            ],
+            "request": dict(self.request),
+        }
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Take a row of `kept_row` or `rejected_row` in."""
+        key = AttemptKey(int(row["source"]), int(row["sphere"]), int(row["k"]))
+        self.kept.pop(key, None)
+        self.rejected.pop(key, None)
+        if row["outcome"] != KEPT:
+            self.rejected[key] = Rejection(str(row["outcome"]), str(row.get("detail", "")))
+            return
+        if not 0 <= key.source < len(self.sources):
+            raise ValueError(f"source {key.source} of {len(self.sources)}")
+        clearance = row.get("clearance_m")
+        self.kept[key] = EpisodeEntry(
+            *key,
+            int(row["steps"]),
+            str(row["content_hash"]),
+            None if clearance is None else float(clearance),
+        )
+
+    @property
+    def attempted(self) -> int:
+        """How many attempts were made."""
+        return len(self.kept) + len(self.rejected)
+
+    def index(self) -> tuple[EpisodeEntry, ...]:
+        """The kept episodes, first attempts first: an order that no interruption changes."""
+        return tuple(sorted(self.kept.values(), key=lambda e: (e.k, e.source, e.sphere)))
+
+    def content_hash(self) -> str:
+        """SHA-256 over the hashes of the sources and of the episodes in order."""
+        return digest(
+            {
+                "sources": self.sources,
+                "episodes": [entry.content_hash for entry in self.index()],
+            }
+        )
+
+
+def kept_row(entry: EpisodeEntry) -> dict[str, Any]:
+    """The manifest's row of an episode."""
+    row = {
+        **entry.key._asdict(),
+        "outcome": KEPT,
+        "steps": entry.steps,
+        "content_hash": entry.content_hash,
+    }
+    return row if entry.clearance is None else row | {"clearance_m": entry.clearance}
+
+
+def rejected_row(key: AttemptKey, rejection: Rejection) -> dict[str, Any]:
+    """The manifest's row of an attempt that gave no episode."""
+    row = {**key._asdict(), "outcome": rejection.outcome}
+    return row | {"detail": rejection.detail} if rejection.detail else row

@@ -1,0 +1,333 @@
+"""The one owner of a dataset directory that is being generated: its lock, manifest and files."""
+
+from __future__ import annotations
+
+import collections
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from sart_toolkit.data.dataset import (
+    MANIFEST,
+    SUMMARY,
+    Dataset,
+    load_dataset,
+    manifest_sources,
+)
+from sart_toolkit.data.manifest import (
+    AttemptKey,
+    EpisodeEntry,
+    Manifest,
+    Rejection,
+    episode_name,
+    kept_row,
+    rejected_row,
+)
+from sart_toolkit.data.records import Annotation, Demonstration, Episode, library_versions
+from sart_toolkit.data.storage import (
+    Journal,
+    check_replaceable,
+    load_episode,
+    remove,
+    save_annotation,
+    save_demonstration,
+    save_episode,
+    write_json,
+)
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, OutputExists, SartError
+
+
+def check_sources(sources: Sequence[tuple[Demonstration, Annotation]]) -> None:
+    """Return if a dataset can be made of demonstrations and their annotations.
+
+    Raises:
+        InvalidInput: there is none.
+        Mismatch: an annotation belongs to another demonstration, or the demonstrations to different
+            tasks or robots.
+    """
+    if not sources:
+        raise InvalidInput("sources: expected at least one demonstration, got none")
+    for demonstration, annotation in sources:
+        annotation.check_matches(demonstration)
+    for what in ("task", "robot"):
+        found = sorted({getattr(demonstration, what) for demonstration, _ in sources})
+        if len(found) > 1:
+            raise Mismatch(
+                f"the demonstrations are of different {what}s ({', '.join(found)}); make a dataset "
+                "of each"
+            )
+
+
+class EpisodeFiles:
+    """Writes the episode files of a dataset directory; picklable, so that any process can."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def write(self, episode: Episode) -> EpisodeEntry:
+        """What the index is to say of an episode, which is on the disk by then.
+
+        Raises:
+            CannotWrite: the disk refuses.
+        """
+        p = episode.provenance
+        clearance = p.certificate["commanded"]["clearance"] if p.certificate else None
+        key = AttemptKey(p.source, p.sphere, p.k)
+        content_hash = save_episode(self._path / episode_name(key), episode)
+        return EpisodeEntry(*key, len(episode), content_hash, clearance)
+
+    def hold(self, entry: EpisodeEntry) -> bool:
+        """Whether an episode's file is there and whole."""
+        try:
+            load_episode(self._path / entry.name, entry.content_hash)
+        except SartError:
+            return False
+        return True
+
+
+class DatasetWriter:
+    """Writes a dataset directory that no other process can write meanwhile; resumes one.
+
+    Killed at any moment, it finds what was kept when it is opened again: an episode's file is
+    written before its row in the manifest, a row without its whole file doesn't count, and a file
+    without a row is written again.
+
+    Attributes:
+        path: the directory.
+        files: writes the episodes, in this process or another.
+        sources: the demonstrations in the directory, with their annotations.
+        finished: the dataset, if it is whole already.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        sources: Sequence[tuple[Demonstration, Annotation]],
+        request: Mapping[str, Any],
+        overwrite: bool = False,
+    ) -> None:
+        """Open a dataset directory to generate, or to go on generating, what is asked for.
+
+        Args:
+            path: the directory; made if needed.
+            sources: demonstrations with their annotations.
+            request: whatever else decides what is generated, as JSON values.
+            overwrite: replace a dataset in `path`.
+
+        Raises:
+            InvalidInput, Mismatch: see `check_sources`.
+            OutputExists: `path` holds something else, or a dataset made with other settings, and
+                `overwrite` is false; the message says which settings.
+            CannotWrite: another process is at work on it, or the disk refuses.
+            BrokenFile: its manifest can't be read.
+        """
+        check_sources(sources)
+        self.path = path = Path(path)
+        hashes = tuple((d.content_hash(), a.content_hash()) for d, a in sources)
+        # As JSON gives it back, to be compared.
+        wanted = Manifest(hashes, json.loads(json.dumps(dict(request))))
+        if not (path / MANIFEST).exists():
+            check_replaceable(path, MANIFEST, overwrite)
+        self._journal = Journal(path / MANIFEST)
+        try:
+            self._manifest = self._opened(wanted, overwrite)
+            self.files = EpisodeFiles(path)
+            self.sources = manifest_sources(path, self._manifest)
+            self.finished = self._checked()
+            if self.finished is None:
+                self._save_sources(sources)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> DatasetWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the directory."""
+        self._journal.close()
+
+    def _opened(self, wanted: Manifest, overwrite: bool) -> Manifest:
+        """The manifest to go on with; a directory that is overwritten is cleared."""
+        journal = self._journal
+        if journal.rows and not overwrite:
+            found = Manifest.from_rows(journal.path, journal.rows)
+            differing = _differences(found.head(), wanted.head())
+            if differing:
+                raise OutputExists(
+                    f"{self.path}: holds a dataset made with other settings "
+                    f"({', '.join(differing)}); add --overwrite or choose another --out"
+                )
+            return found
+        # The manifest goes last: until then the directory is a dataset with files missing.
+        for inside in sorted(self.path.iterdir()):
+            if inside != journal.path:
+                remove(inside)
+        journal.clear()
+        journal.append(wanted.head())
+        return wanted
+
+    def _checked(self) -> Dataset | None:
+        """The dataset if nothing is missing; what is broken is left to be made again."""
+        # A process that was killed leaves the file that it was writing.
+        for temporary in self.path.rglob(".*"):
+            remove(temporary)
+        manifest = self._manifest
+        broken = [entry.key for entry in manifest.kept.values() if not self.files.hold(entry)]
+        for key in broken:
+            del manifest.kept[key]
+        if not broken and (self.path / SUMMARY).exists():
+            try:
+                return load_dataset(self.path)
+            except BrokenFile:
+                pass
+        remove(self.path / SUMMARY)
+        return None
+
+    def _save_sources(self, sources: Sequence[tuple[Demonstration, Annotation]]) -> None:
+        for source, (demonstration, annotation) in zip(self.sources, sources, strict=True):
+            save_demonstration(source.path / "demo.h5", demonstration)
+            save_annotation(source.path / "annotation.json", annotation)
+
+    @property
+    def n_kept(self) -> int:
+        """How many episodes are kept so far."""
+        return len(self._manifest.kept)
+
+    @property
+    def n_rejected(self) -> int:
+        """How many attempts gave no episode so far."""
+        return len(self._manifest.rejected)
+
+    @property
+    def rejections(self) -> dict[str, int]:
+        """How many attempts gave no episode so far, by outcome."""
+        return _counted(self._manifest.rejected.values())
+
+    @property
+    def last_rejection(self) -> Rejection | None:
+        """Why the last attempt without an episode gave none."""
+        return next(reversed(self._manifest.rejected.values()), None)
+
+    def missing(self, source: int, sphere: int, wanted: int, limit: int) -> list[AttemptKey]:
+        """The attempts from a sphere by which `wanted` could be kept, no k beyond `limit`."""
+        kept, rejected = self._manifest.kept, self._manifest.rejected
+        keys = [AttemptKey(source, sphere, k) for k in range(limit)]
+        missing = [key for key in keys if key not in kept and key not in rejected]
+        return missing[: max(0, wanted - sum(key in kept for key in keys))]
+
+    def keep(self, entry: EpisodeEntry) -> None:
+        """Take an episode in whose file is written; it is kept for good when this returns.
+
+        Raises:
+            CannotWrite: the disk refuses.
+        """
+        self._append(kept_row(entry))
+
+    def reject(self, key: AttemptKey, rejection: Rejection) -> None:
+        """Note that an attempt gave no episode, and why.
+
+        Raises:
+            CannotWrite: the disk refuses.
+        """
+        self._append(rejected_row(key, rejection))
+
+    def _append(self, row: Mapping[str, Any]) -> None:
+        self._journal.append(row)
+        self._manifest.add(row)
+
+    def finish(self, info: Mapping[str, Any]) -> Dataset:
+        """The dataset as it is now, whole; `dataset.json` also says what `info` has.
+
+        Raises:
+            CannotWrite: the disk refuses.
+        """
+        manifest = self._manifest
+        clearances = [e.clearance for e in manifest.kept.values() if e.clearance is not None]
+        summary = {
+            **info,
+            "n_trajectories": self.n_kept + len(self.sources),
+            "n_kept": self.n_kept,
+            "n_attempted": self.n_kept + self.n_rejected,
+            "rejections": self.rejections,
+            "by_sphere": [
+                self._tally(source, sphere)
+                for source in range(len(self.sources))
+                for sphere in range(len(self.sources[source].annotation.spheres))
+            ],
+            "least_clearance_m": min(clearances, default=None),
+            "content_hash": manifest.content_hash(),
+            "versions": library_versions(),
+        }
+        write_json(self.path / SUMMARY, summary)
+        return load_dataset(self.path)
+
+    def _tally(self, source: int, sphere: int) -> dict[str, Any]:
+        """How the attempts from one sphere ended."""
+        here = (source, sphere)
+        manifest = self._manifest
+        return {
+            "source": source,
+            "waypoint": self.sources[source].annotation.spheres[sphere].waypoint,
+            "kept": sum(key[:2] == here for key in manifest.kept),
+            "rejections": _counted(r for key, r in manifest.rejected.items() if key[:2] == here),
+        }
+
+
+def _counted(rejections: Iterable[Rejection]) -> dict[str, int]:
+    return dict(sorted(collections.Counter(r.outcome for r in rejections).items()))
+
+
+def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
+    """Where two JSON values differ, with what each has there."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        pairs = {key: (found.get(key), wanted.get(key)) for key in found | wanted}
+    elif isinstance(found, list) and isinstance(wanted, list):
+        if len(found) != len(wanted):
+            return [f"{len(found)} {name}, now {len(wanted)}"]
+        pairs = {str(i): pair for i, pair in enumerate(zip(found, wanted, strict=True))}
+    else:
+        return [] if found == wanted else [f"{name} {_short(found)}, now {_short(wanted)}"]
+    return [
+        line
+        for key, (a, b) in pairs.items()
+        for line in _differences(a, b, f"{name}.{key}" if name else key)
+    ]
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 20 else f"{text[:16]}..."
+
+
+def write_dataset(
+    path: Path,
+    sources: Sequence[tuple[Demonstration, Annotation]],
+    episodes: Iterable[Episode],
+    info: Mapping[str, Any],
+) -> Dataset:
+    """A dataset directory of episodes that were made elsewhere, written one at a time.
+
+    Args:
+        path: the directory.
+        sources: demonstrations with their annotations.
+        episodes: what was generated from them; only one needs to be in memory.
+        info: what `dataset.json` is to say besides counts and hash.
+
+    Raises:
+        InvalidInput, Mismatch, OutputExists, CannotWrite: see `DatasetWriter`.
+    """
+    with DatasetWriter(path, sources, {}) as writer:
+        for episode in episodes:
+            writer.keep(writer.files.write(episode))
+        return writer.finish(info)
