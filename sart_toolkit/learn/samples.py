@@ -280,19 +280,17 @@ def _trajectories(
 
     Steps are numbered as they are yielded: an episode's are followed by its demonstration's.
     """
-    shown: dict[str, tuple[Demonstration, int, Array]] = {}
+    shown: list[tuple[Demonstration, int, Array]] = []
     n_yielded = 0
     for source in dataset.sources:
         demonstration = source.demonstration
         actions = demonstration.actions
-        shown[demonstration.content_hash()] = demonstration, n_yielded, actions
+        shown.append((demonstration, n_yielded, actions))
         yield demonstration.steps, np.arange(0), actions
         n_yielded += len(demonstration)
-    for i, episode in enumerate(dataset):
-        t_star, sha = episode.provenance.t_star, episode.provenance.demonstration_hash
-        if sha not in shown:
-            raise Mismatch(f"episode {i} was generated from another demonstration; generate again")
-        demonstration, first, actions = shown[sha]
+    for i, (entry, episode) in enumerate(zip(dataset.index, dataset, strict=True)):
+        t_star = episode.provenance.t_star
+        demonstration, first, actions = shown[entry.source]
         if not 0 <= t_star < len(demonstration):
             raise Mismatch(
                 f"episode {i} rejoins at step {t_star} of a demonstration of "

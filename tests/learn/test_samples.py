@@ -286,7 +286,7 @@ def _with_last(path, dataset, steps=None, **provenance):
 
 
 def test_an_episode_of_another_demonstration_is_refused(dataset, open_windows, tmp_path):
-    with pytest.raises(Mismatch, match="episode 2 was generated from another demonstration"):
+    with pytest.raises(Mismatch, match="sphere00_k00002.h5 was generated from another demo"):
         open_windows(_with_last(tmp_path, dataset, demonstration_hash="0"))
 
 

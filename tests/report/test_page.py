@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
-from sart_toolkit.data.records import Dataset, Demonstration
+from sart_toolkit.data.dataset import Dataset
+from sart_toolkit.data.records import Demonstration
+from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import BrokenFile, CannotWrite, Mismatch, MissingFile
 from sart_toolkit.report import page as report
 from sart_toolkit.report.figures import film_strip
