@@ -408,7 +408,7 @@ def _drop_from_cache(file: Path, windows: Windows) -> None:
 _OPEN = """
 from sart_toolkit.data.dataset import load_dataset
 from pathlib import Path
-started = time.perf_counter()
+begin()
 result = {"episodes": len(load_dataset(Path(sys.argv[1])))}
 """
 _INFO = """
@@ -422,7 +422,7 @@ from bench import augmentation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 demonstration, annotation, make = augmentation(sys.argv[2], int(sys.argv[3]))
-started = time.perf_counter()
+begin()
 dataset = augment_demonstration(
     demonstration, annotation, make, Path(sys.argv[1]), AugmentConfig(int(sys.argv[4]))
 )
@@ -430,9 +430,13 @@ result = {"kept": len(dataset)}
 """
 _MEASURED = """
 import json, sys, time
-started = time.perf_counter()
+def begin():
+    global started
+    started = time.perf_counter(), time.process_time()
+begin()
 {}
-result["seconds"] = time.perf_counter() - started
+result["seconds"] = time.perf_counter() - started[0]
+result["processor_seconds"] = time.process_time() - started[1]
 status = open("/proc/self/status").read()
 # Of this program alone: what `getrusage` says counts the memory of the one that started it.
 result["peak_mb"] = int(status.split("VmHWM:")[1].split()[0]) / 1024
