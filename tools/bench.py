@@ -284,11 +284,12 @@ def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
     """Training from the file of images: its memory, and images/s over a copy in memory.
 
     As many episodes as asked for are made up and read by `open_windows`, then steps are taken on
-    random batches from its file; the peak of this process's memory so far, its imports included,
-    is what is reported: all of it, and the part that no file backs. Only then the
-    images are copied into memory, and blocks of steps on batches from the file and from the copy
-    alternate, so that whatever else the machine does slows both; the ratio is the median over
-    blocks. Last, blocks of steps after the kernel was told to drop what it keeps of the file.
+    random batches from its file; the peak of this process's memory so far, its
+    imports included, is what is reported: all of it, and the part that no file backs. Only then the
+    images are copied into memory, and steps on batches from the file and from the copy alternate,
+    so that whatever else the machine does slows both; the ratios, of time that passed and of the
+    processor's time, are medians over blocks of steps. `file_from_disk`: after the kernel was told
+    to drop what it keeps of the file.
     """
     parser = argparse.ArgumentParser(
         prog="bench.py training-data", description=bench_training_data.__doc__
@@ -331,22 +332,25 @@ def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
         peak = _memory("VmHWM")
 
         copy = windows.to(torch.device("cpu"))
-        copied_step = _stepper(config, _random_batches(config, copy))
-        n_images = config.batch_size * config.history * options.steps
-
-        def block(step: Callable[[], float]) -> float:
-            return n_images / sum(step() for _ in range(options.steps))
-
-        block(copied_step)
-        mapped, copied, cold = [], [], []
+        steps = {"file": mapped_step, "copy": _stepper(config, _random_batches(config, copy))}
+        steps["copy"]()
+        walls: dict[str, list[float]] = {name: [] for name in ("file", "copy", "file_from_disk")}
+        processors: dict[str, list[float]] = {name: [] for name in steps}
         for turn in range(options.blocks):
-            mapped.append(block(mapped_step))
-            copied.append(block(copied_step))
-            _say(f"block {turn + 1}/{options.blocks}: {mapped[-1] / copied[-1]:.3f} of a copy")
-        for _ in range(options.blocks):
+            for figures in (*walls.values(), *processors.values()):
+                figures.append(0.0)
+            for _ in range(options.steps):
+                for name, step in steps.items():
+                    began = time.process_time()
+                    walls[name][-1] += step()
+                    processors[name][-1] += time.process_time() - began
             _drop_from_cache(file, windows)
-            cold.append(block(mapped_step))
-        ratios = [a / b for a, b in zip(mapped, copied, strict=True)]
+            walls["file_from_disk"][-1] = sum(mapped_step() for _ in range(options.steps))
+            ratio = walls["copy"][-1] / walls["file"][-1]
+            _say(f"block {turn + 1}/{options.blocks}: {ratio:.3f} of a copy")
+        n_images = config.batch_size * config.history * options.steps
+        ratios = [b / a for a, b in zip(walls["file"], walls["copy"], strict=True)]
+        processor = [b / a for a, b in zip(processors["file"], processors["copy"], strict=True)]
         return {
             "episodes": options.episodes,
             "images": len(windows.gripper),
@@ -359,13 +363,11 @@ def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
                 "total": peak / 1e9,
             },
             "images_per_second": {
-                "file": statistics.median(mapped),
-                "copy": statistics.median(copied),
-                "file_from_disk": statistics.median(cold),
+                name: n_images / statistics.median(seconds) for name, seconds in walls.items()
             },
             "file_over_copy": statistics.median(ratios),
             "file_over_copy_range": [min(ratios), max(ratios)],
-            "file_from_disk_over_copy": statistics.median(cold) / statistics.median(copied),
+            "file_over_copy_by_processor_time": statistics.median(processor),
             "policy": config.policy,
             "image_size": config.image_size,
             "image_shift": config.image_shift,
