@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sart_toolkit.augment.strategies import get_strategy
-from sart_toolkit.collision.demonstrated import GRASP_PLAY
+from sart_toolkit.collision.phases import IN_GRASP_SLIP
+from sart_toolkit.collision.world import SOURCES, Source
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
@@ -23,7 +24,8 @@ class AugmentConfig:
     `n`: trajectories in all, the demonstration among them; how the spheres share the others tells
     `quotas`, their weights being their radii, or with `share` "equal" all the same, as in the
     paper. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
-    proved to keep `margin` [m] free, even if what is carried moves by `grasp_play` [m] in the
+    proved to keep `margin` [m] free of the `obstacles`, the bodies of the scene or the cloud that
+    the demonstration's cameras saw, even if what is grasped moves by `slip_tolerance` [m] in the
     grasp; if any point of it moves farther the segment is rejected. `camera`: whose pictures are
     recorded, `None` for none.
     """
@@ -34,7 +36,8 @@ class AugmentConfig:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     duration: float = 2.0
     margin: float = 0.0002
-    grasp_play: float = GRASP_PLAY
+    slip_tolerance: float = IN_GRASP_SLIP
+    obstacles: Source = "scene"
     seed: int = 0
     camera: str | None = "wrist"
 
@@ -45,8 +48,10 @@ class AugmentConfig:
             raise InvalidInput(f"seed: expected a whole number >= 0, got {self.seed}")
         if self.share not in SHARES:
             raise unknown_name("share", self.share, SHARES)
+        if self.obstacles not in SOURCES:
+            raise unknown_name("obstacles", self.obstacles, SOURCES)
         check_positive("duration", self.duration, "s")
-        for name in ("margin", "grasp_play"):
+        for name in ("margin", "slip_tolerance"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidInput(f"{name}: expected a finite number >= 0 m, got {value}")

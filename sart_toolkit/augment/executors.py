@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.planner import SegmentPlanner, path_deviation
+from sart_toolkit.augment.planner import SegmentPlanner, path_deviation, world_of
 from sart_toolkit.backends.interface import Backend, Observation
-from sart_toolkit.collision.certificate import Certificate, certify
+from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.data.records import (
     CONTROL_HZ,
     CONTROL_PER_RECORD,
@@ -57,14 +57,14 @@ class SegmentMaker:
         """Make tries on `backend`, the robot in the demonstration's scene.
 
         Raises:
-            Mismatch: the demonstration doesn't tell where the scene's bodies were.
+            Mismatch: the demonstration is of another robot, or doesn't tell where the scene's
+                bodies were.
         """
         self._backend = backend
         self._demonstration, self._annotation = demonstration, annotation
         self._config = config
-        self._planner = SegmentPlanner(
-            backend.robot, backend.scene, demonstration, annotation, config
-        )
+        self._world = world_of(demonstration, backend.robot, backend.scene, config)
+        self._planner = SegmentPlanner(self._world, annotation, config)
 
     def __call__(self, sphere: int, k: int) -> Attempt:
         """The k-th try from a sphere: sample, prove, move there, check, and reverse the record.
@@ -111,9 +111,8 @@ class SegmentMaker:
         """The record of a motion's execution, and the joints `(m, n)` as measured on the way."""
         backend, steps = self._backend, self._demonstration.steps
         gripper = float(steps.commanded_gripper[t_star])
-        scene = self._planner.scene
-        carried = scene.phases[t_star].carried
-        controller = ToolController(scene.collision.kinematics)
+        carried = self._world.phases[t_star].grasped
+        controller = ToolController(self._world.kinematics)
         backend.restore(self._demonstration.states[t_star])
         controller.reset(
             steps.commanded_joint_positions[t_star], steps.commanded_Ts_world_tool[t_star]
@@ -135,7 +134,7 @@ class SegmentMaker:
             else:
                 seen = recorded = recorder.add(controller, gripper, 0.0)
             measured.append(seen.joint_path if len(seen.joint_path) else seen.q[None])
-        check_undisturbed(backend.scene, carried, start, recorded, self._config.grasp_play)
+        check_undisturbed(backend.scene, carried, start, recorded, self._config.slip_tolerance)
         return recorder, np.concatenate(measured)
 
     def _proof(
@@ -146,9 +145,8 @@ class SegmentMaker:
         Raises:
             MotionRejected: the measured path can't be proved clear.
         """
-        placed = self._planner.scene.placed(t_star)
-        deviation = path_deviation(placed, motion, joint_path)
-        measured = certify(placed, PolylinePath(joint_path))
+        deviation = path_deviation(self._world.placed(t_star), motion, joint_path)
+        measured = self._world.certify(t_star, PolylinePath(joint_path))
         if measured.verdict != "free":
             raise MotionRejected(
                 f"left its path {' / '.join(measured.pair)}: by {deviation * 1e3:.1f} mm, "
@@ -181,7 +179,7 @@ def check_undisturbed(
     carried: frozenset[str],
     start: Observation,
     end: Observation,
-    grasp_play: float,
+    slip_tolerance: float,
 ) -> None:
     """Return if what is carried stayed in the grasp and all else where it was.
 
@@ -194,7 +192,7 @@ def check_undisturbed(
         Ts = [seen.Ts_world_body[body.name] for seen in (start, end)]
         most = _MOVED
         if body.name in carried:
-            most = grasp_play
+            most = slip_tolerance
             Ts = [inverse(seen.T_world_tool) @ T for seen, T in zip((start, end), Ts, strict=True)]
         # The farthest that any point of the body has moved.
         corners = np.concatenate([shape.corners() for shape in body.shapes])

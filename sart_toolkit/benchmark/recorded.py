@@ -14,11 +14,13 @@ from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots.model import RobotModel
 
-_BLIND = SessionConfig(cameras=())
+BLIND = SessionConfig(cameras=())
 
 
-def recorded(cell: Cell, backend: Backend, seed: int) -> Demonstration:
-    """The scripted operator's demonstration of a cell's task, without pictures.
+def recorded(
+    cell: Cell, backend: Backend, seed: int, config: SessionConfig = BLIND
+) -> Demonstration:
+    """The scripted operator's demonstration of a cell's task, without pictures if not asked for.
 
     Raises:
         Mismatch: it did not reach the goal.
@@ -28,7 +30,7 @@ def recorded(cell: Cell, backend: Backend, seed: int) -> Demonstration:
     placement = task.sample_placement(rng)
     model = RobotModel(backend.robot, backend.scene.held)
     operator = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
-    shown = record_demonstration(backend, task, model, operator, placement, config=_BLIND)
+    shown = record_demonstration(backend, task, model, operator, placement, config=config)
     if not task.achieved(shown.success):
         raise Mismatch(f"{cell.name}: the demonstration did not reach the goal; try another --seed")
     return shown

@@ -14,6 +14,7 @@ import pytest
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import Attempt
 from sart_toolkit.augment.planner import SegmentPlanner
+from sart_toolkit.benchmark import segments
 from sart_toolkit.benchmark.operator import Cell
 from sart_toolkit.benchmark.segments import (
     SegmentsConfig,
@@ -22,13 +23,12 @@ from sart_toolkit.benchmark.segments import (
     tool_off_path,
 )
 from sart_toolkit.cli import main
-from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.collision.exact import ExactWorld
+from sart_toolkit.data.records import Annotation
 from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
-from sart_toolkit.evaluate import segments
 from sart_toolkit.motion import timing
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array
-from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.tasks import get_task
@@ -172,16 +172,11 @@ def test_a_demonstration_that_fails_is_refused(
 
 
 @pytest.fixture(scope="module")
-def wide_motion(
-    peg_task: Task, peg_demonstration: Demonstration, peg_annotation: Annotation
-) -> tuple[Motion, Array]:
+def wide_motion(peg_world: ExactWorld, peg_annotation: Annotation) -> tuple[Motion, Array]:
     """A motion from the widest sphere, and the joints that it starts from."""
-    planner = SegmentPlanner(
-        get_robot(peg_task.robot), peg_task.scene, peg_demonstration, peg_annotation,
-        AugmentConfig(camera=None),
-    )  # fmt: skip
+    planner = SegmentPlanner(peg_world, peg_annotation, AugmentConfig(camera=None))
     proposal, rng = planner.proposal(0, 0)
-    q_start = peg_demonstration.steps.commanded_joint_positions[proposal.t_star]
+    q_start = peg_world.demonstration.steps.commanded_joint_positions[proposal.t_star]
     return planner.plan(proposal, rng)[0], q_start
 
 

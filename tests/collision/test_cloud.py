@@ -12,11 +12,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sart_toolkit.collision.cloud import (
-    CarriedObject,
     CloudConfig,
+    GraspedObject,
     SceneCloud,
-    carried_object,
     fuse_cloud,
+    grasped_object,
     surface_errors,
 )
 from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
@@ -306,7 +306,7 @@ def carrying(request, pictured, way_down):
 def test_what_was_carried_is_found_in_the_tool_frame(carrying, robot, before):
     demonstration = carrying
     config = CloudConfig(unknown="free")
-    found = carried_object(demonstration, robot, (), range(12, len(demonstration)), before, config)
+    found = grasped_object(demonstration, robot, (), range(12, len(demonstration)), before, config)
     assert len(found.points) > 30
     assert on_box(found.points, T_TOOL_BOX).all()
     # Its width is seen in full, to a pixel or two.
@@ -316,8 +316,8 @@ def test_what_was_carried_is_found_in_the_tool_frame(carrying, robot, before):
 def test_an_object_held_from_the_start_is_taken_to_be_as_deep_as_the_unknown(carrying, robot):
     demonstration = carrying
     after = range(12, len(demonstration))
-    visible = carried_object(demonstration, robot, (), after, config=CloudConfig(unknown="free"))
-    deep = carried_object(demonstration, robot, (), after)
+    visible = grasped_object(demonstration, robot, (), after, config=CloudConfig(unknown="free"))
+    deep = grasped_object(demonstration, robot, (), after)
     assert len(deep.points) == 2 * len(visible.points)
     shift = deep.points[len(visible.points) :] - visible.points
     np.testing.assert_allclose(np.linalg.norm(shift, axis=1), 0.03)
@@ -331,21 +331,21 @@ def test_what_was_taken_out_of_sight_is_found_where_pictures_look_through(
 ):
     T_box = way_down[12] @ T_TOOL_BOX
     taken = pictured(lambda t: [T_box] if t < 12 else [])
-    found = carried_object(taken, robot, (), range(12, len(taken)), range(12))
+    found = grasped_object(taken, robot, (), range(12, len(taken)), range(12))
     assert len(found.points) > 30
     assert on_box(found.points, T_TOOL_BOX).all()
 
 
 def test_nothing_is_carried_where_all_stays_or_the_tool_does_not_move(pictured, carrying, robot):
     still = pictured(lambda t: [BOX])
-    assert carried_object(still, robot, (), range(12, len(still)), range(12)) is None
-    assert carried_object(carrying, robot, (), range(12, 13), range(12)) is None
+    assert grasped_object(still, robot, (), range(12, len(still)), range(12)) is None
+    assert grasped_object(carrying, robot, (), range(12, 13), range(12)) is None
 
 
 def test_what_was_carried_is_no_part_of_the_scene_before_or_after(carrying, robot):
     demonstration = carrying
     n = len(demonstration)
-    found = carried_object(demonstration, robot, (), range(12, n), range(12))
+    found = grasped_object(demonstration, robot, (), range(12, n), range(12))
     cloud = fuse_cloud(demonstration, robot, (), carried=[found])
     assert np.abs(seen(cloud)[:, 2] - FLOOR).max() < 1e-3
     smeared = fuse_cloud(demonstration, robot, ())
@@ -492,7 +492,7 @@ def test_a_waypoint_out_of_range_is_refused(peg_demonstration, robot, waypoints)
     with pytest.raises(InvalidInput, match=r"waypoint (-1|10000): expected 0 to \d+; choose"):
         fuse_cloud(peg_demonstration, robot, (), waypoints)
     with pytest.raises(InvalidInput, match=r"waypoint (-1|10000): expected 0 to \d+; choose"):
-        carried_object(peg_demonstration, robot, (), waypoints)
+        grasped_object(peg_demonstration, robot, (), waypoints)
 
 
 def test_no_waypoint_at_all_is_refused(peg_demonstration, robot):
@@ -505,12 +505,12 @@ def test_another_robot_is_refused(peg_demonstration):
         fuse_cloud(peg_demonstration, get_robot("ur5e_hande"), ())
 
 
-def test_a_carried_object_is_made_of_points_and_waypoints():
-    assert CarriedObject(CUBE, (1, 2)).points.shape == (8, 3)
+def test_a_grasped_object_is_made_of_points_and_waypoints():
+    assert GraspedObject(CUBE, (1, 2)).points.shape == (8, 3)
     with pytest.raises(InvalidInput, match="waypoints of a carried object: expected at least one"):
-        CarriedObject(CUBE, ())
+        GraspedObject(CUBE, ())
     with pytest.raises(InvalidInput, match="points: expected shape"):
-        CarriedObject(np.zeros(3), (1,))
+        GraspedObject(np.zeros(3), (1,))
 
 
 @pytest.mark.parametrize("points", [CUBE[:3], CUBE * [1, 1, 0]], ids=["three", "flat"])
