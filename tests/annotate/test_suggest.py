@@ -189,7 +189,10 @@ def test_a_little_larger_than_suggested_some_pose_would_touch(
         assert sphere.limited_by == "peg / block"
         placed = peg_world.placed(sphere.waypoint)
         near = peg_demonstration.steps.joint_positions[sphere.waypoint]
-        gap = next(peg_world.gaps(sphere.waypoint))
+        q_key = peg_demonstration.steps.joint_positions[sphere.waypoint]
+        pair = min(placed.tool_pairs(), key=lambda k: placed.pair_distances(q_key, [k])[0])
+        T_world_joint = placed.joint_poses(q_key)[-1]
+        gap = Gap.of(placed, pair, placed.witness(q_key, pair), T_world_joint)
         corners = gap.points[np.argsort(gap.points @ gap.normal)[:4]]
         grown, least = 1.15 * sphere.radius, np.inf
         for _ in range(400):

@@ -346,7 +346,7 @@ def test_what_was_carried_is_no_part_of_the_scene_before_or_after(carrying, robo
     demonstration = carrying
     n = len(demonstration)
     found = grasped_object(demonstration, robot, (), range(12, n), range(12))
-    cloud = fuse_cloud(demonstration, robot, (), carried=[found])
+    cloud = fuse_cloud(demonstration, robot, (), grasped=[found])
     assert np.abs(seen(cloud)[:, 2] - FLOOR).max() < 1e-3
     smeared = fuse_cloud(demonstration, robot, ())
     assert (seen(smeared)[:, 2] > FLOOR + 0.01).sum() > 30
@@ -371,19 +371,20 @@ def cube():
 
 def test_the_distance_to_a_point_is_that_to_its_ball(cube):
     obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.05]], inflation=0.002))
-    (found,) = obstacles.distances(cube, pose([0.0, 0.003, 0.0]), 0.0)
-    assert found.body == "cube"
-    assert found.distance == pytest.approx(0.038, abs=1e-6)
-    np.testing.assert_allclose(found.normal, [0, 0, -1], atol=1e-6)
-    np.testing.assert_allclose(found.p_cloud, [0, 0, 0.05])
+    T = pose([0.0, 0.003, 0.0])
+    (found,) = obstacles.separations(cube, T, 0.0)
+    assert found.distance == obstacles.distance(cube, T) == pytest.approx(0.038, abs=1e-6)
+    np.testing.assert_allclose(found.p_ball, [0, 0, 0.048], atol=1e-6)
     np.testing.assert_allclose(found.p_part, [0, 0, 0.01], atol=1e-6)
 
 
 def test_a_point_inside_a_part_is_as_deep_as_the_nearest_face_and_its_ball(cube):
     obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.007]], inflation=0.002))
-    (found,) = obstacles.distances(cube, np.eye(4), 0.0)
+    (found,) = obstacles.separations(cube, np.eye(4), 0.0)
     assert found.distance == pytest.approx(-0.005, abs=1e-5)
-    np.testing.assert_allclose(found.normal, [0, 0, -1], atol=1e-4)
+    # The ball has to go up by that, and the cube down.
+    np.testing.assert_allclose(found.p_ball, [0, 0, 0.005], atol=1e-5)
+    np.testing.assert_allclose(found.p_part, [0, 0, 0.01], atol=1e-5)
 
 
 @pytest.mark.parametrize("within", [0.0, 0.01, 0.05])
@@ -398,15 +399,13 @@ def test_no_point_that_is_near_enough_is_missed(peg_model, within):
         cloud = cloud_of(p @ T[:3, :3].T + T[:3, 3])
         obstacles = CloudObstacles(cloud)
         exact = np.array([one_by_one(obstacles, part, T, q) for q in cloud.points])
-        found = obstacles.distances(part, T, within)
+        found = obstacles.separations(part, T, within)
         distances = [each.distance for each in found]
         assert distances == sorted(distances)
         wanted = np.sort(exact[exact <= exact.min() + within - 1e-6])
         np.testing.assert_allclose(distances[: len(wanted)], wanted, atol=2e-6)
         assert len(distances) >= len(wanted)
-        assert obstacles.nearest([(part, T)]).distance == pytest.approx(exact.min(), abs=2e-6)
-        assert obstacles.any_within([(part, T)], exact.min() - 1e-5) is None
-        assert obstacles.any_within([(part, T)], exact.min() + 1e-5) == part.body
+        assert obstacles.distance(part, T) == pytest.approx(exact.min(), abs=2e-6)
 
 
 def one_by_one(obstacles, part, T, p):
@@ -418,20 +417,15 @@ def one_by_one(obstacles, part, T, p):
     )
 
 
-def test_the_nearest_of_several_parts_and_the_one_too_near_are_told_by_name(cube):
-    other = hull_part("other", 1, CUBE)
-    obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.0]]))
-    parts = [(cube, pose([0.1, 0, 0])), (other, pose([0, 0.05, 0]))]
-    assert obstacles.nearest(parts).body == "other"
-    assert obstacles.any_within(parts, 0.045) == "other"
-    assert obstacles.any_within(parts, 0.03) is None
+def test_clearances_are_distances_of_bare_points_from_the_nearest_ball():
+    obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], inflation=0.002))
+    p = np.array([[[0.0, 0.0, 0.1], [1.0, 0.001, 0.0]]])
+    np.testing.assert_allclose(obstacles.clearances(p), [[0.098, -0.001]], atol=1e-12)
 
 
-def test_an_empty_cloud_is_near_to_nothing(cube):
-    obstacles = CloudObstacles(cloud_of([]))
-    assert obstacles.distances(cube, np.eye(4), 0.1) == []
-    assert obstacles.nearest([(cube, np.eye(4))]) is None
-    assert obstacles.any_within([(cube, np.eye(4))], 1.0) is None
+def test_a_cloud_without_points_is_no_obstacle_but_a_mistake():
+    with pytest.raises(InvalidInput, match="cloud: expected at least one point, got none; look"):
+        CloudObstacles(cloud_of([]))
 
 
 # --- the yardstick ------------------------------------------------------------------------------
@@ -507,7 +501,7 @@ def test_another_robot_is_refused(peg_demonstration):
 
 def test_a_grasped_object_is_made_of_points_and_waypoints():
     assert GraspedObject(CUBE, (1, 2)).points.shape == (8, 3)
-    with pytest.raises(InvalidInput, match="waypoints of a carried object: expected at least one"):
+    with pytest.raises(InvalidInput, match="waypoints of a grasped object: expected at least one"):
         GraspedObject(CUBE, ())
     with pytest.raises(InvalidInput, match="points: expected shape"):
         GraspedObject(np.zeros(3), (1,))

@@ -105,7 +105,7 @@ def test_what_is_carried_may_move_in_the_grasp_by_its_play(picked, toolbox, firs
         placed = scene.placed(t)
         carried = np.array([placed.names(k)[0] == "toolbox" for k in range(len(placed.pairs))])
         np.testing.assert_array_equal(placed.slip, play * carried)
-        assert not scene.placed(3).play.any()
+        assert not scene.placed(3).slip.any()
 
 
 def test_a_scene_is_put_together_once_for_each_waypoint(picked):

@@ -682,11 +682,9 @@ def test_distances_are_those_of_pybullet(robot, peg_task, rng):
 def rough_distances(placed, q):
     """What spheres and boxes say of each pair's distance."""
     bounds = placed.bounds
-    centres, axes, middles = (each[0] for each in bounds.placed(placed.joint_poses(q)[None]))
     every = np.arange(len(placed.pairs))
-    return bounds.rough_distances(
-        centres[bounds.first], axes[bounds.second], middles[bounds.second], every
-    )
+    enclosures = bounds.placed(placed.joint_poses(q)[None])
+    return bounds.rough_distances(enclosures, np.zeros_like(every), every)
 
 
 def assert_not_above(rough, exact):
@@ -724,7 +722,7 @@ def test_spheres_and_boxes_enclose_what_they_stand_for(cluttered, kind, rng):
     placed = cluttered[kind]
     bounds = placed.bounds
     q = joints_near(placed, rng)
-    centres, axes, middles = (each[0] for each in bounds.placed(placed.joint_poses(q)[None]))
+    centres, axes, middles, _ = (each[0] for each in bounds.placed(placed.joint_poses(q)[None]))
     world = [
         part.points @ T[:3, :3].T + T[:3, 3]
         for part, (_, T) in zip(placed.parts, poses_of_parts(placed, q), strict=True)
@@ -897,7 +895,7 @@ def test_a_body_whose_pose_is_missing_is_told(start):
 
 def test_a_carried_body_that_the_scene_has_not_is_told(start):
     Ts = start.state.Ts_world_body
-    with pytest.raises(UnknownName, match="unknown carried body 'blok': did you mean 'block'"):
+    with pytest.raises(UnknownName, match="unknown grasped body 'blok': did you mean 'block'"):
         start.collision.placed(Ts, 0.0, {"blok": np.eye(4)})
 
 
