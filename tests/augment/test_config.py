@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.errors import UnknownName
+from sart_toolkit.errors import InvalidInput, UnknownName
 
 radii = st.lists(st.floats(0.004, 0.2), min_size=1, max_size=8)
 numbers = st.integers(2, 200)
@@ -16,6 +16,17 @@ numbers = st.integers(2, 200)
 def test_an_unknown_share_is_refused():
     with pytest.raises(UnknownName, match="share 'radios'.*radius"):
         AugmentConfig(share="radios")
+
+
+def test_obstacles_known_from_elsewhere_are_refused():
+    with pytest.raises(UnknownName, match="unknown obstacles 'clouds': did you mean 'cloud'"):
+        AugmentConfig(obstacles="clouds")
+
+
+@pytest.mark.parametrize("name", ["margin", "slip_tolerance"])
+def test_a_negative_length_is_refused(name):
+    with pytest.raises(InvalidInput, match=f"{name}: expected a finite number >= 0 m, got -0.1"):
+        AugmentConfig(**{name: -0.1})
 
 
 @given(radii=radii, n=numbers)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import Attempt
 from sart_toolkit.augment.planner import SegmentPlanner
+from sart_toolkit.backends import make_backend
 from sart_toolkit.benchmark import segments
 from sart_toolkit.benchmark.operator import Cell
 from sart_toolkit.benchmark.segments import (
@@ -29,6 +31,7 @@ from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
 from sart_toolkit.motion import timing
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array
+from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.tasks import get_task
@@ -87,6 +90,22 @@ def test_segments_are_tallied_by_sphere_and_their_motions_checked(
     written = json.loads((tmp_path / "out.json").read_text())
     assert (written["cells"], written["command"]) == (result["cells"], "sart")
     assert [path.name for path in tmp_path.iterdir()] == ["out.json"]
+
+
+def test_against_the_cloud_nothing_is_proved_of_bodies_and_nothing_touches_them(
+    tmp_path: Path, peg_task: Task
+) -> None:
+    make = functools.partial(
+        make_backend, "pybullet", get_robot(peg_task.robot), peg_task.scene, 64
+    )
+    config = SegmentsConfig(4, obstacles="cloud")
+    result = benchmark_segments([Cell(peg_task, "pybullet", make)], config, tmp_path / "out.json")
+    row = result["cells"][PEG]
+    assert (row["attempted"], row["kept"], row["contacts"]) == (4, 4, 0)
+    assert {sphere["limited_by"] for sphere in row["spheres"]} <= {
+        "peg / cloud", "peg / cloud at waypoint 31"
+    }  # fmt: skip
+    assert result["config"]["obstacles"] == "cloud"
 
 
 def test_contacts_and_paths_that_were_left_are_told_apart_from_other_rejections(
