@@ -237,9 +237,9 @@ def suggest_radius(
     room = _room_before_event(demonstration, world.phases, t)
     if room is not None and room.radius < config.min_radius:
         return room
-    moving = world.moving(t)
-    if moving is not None:
-        return Suggestion(0.0, None, f"{moving} moves")
+    unfit = _unfit(world, t)
+    if unfit is not None:
+        return Suggestion(0.0, None, unfit)
     best = proved_radius(world, t, config)
     if room is not None and room.radius < best.radius:
         best = dataclasses.replace(room, clearance=best.clearance)
@@ -255,6 +255,12 @@ def suggest_radius(
     return Suggestion(0.0, best.clearance, best.limited_by)
 
 
+def _unfit(world: CollisionWorld, t: int) -> str | None:
+    """Why nothing can be proved at waypoint `t`, or None."""
+    moving = world.moving(t)
+    return world.unknown(t) if moving is None else f"{moving} moves"
+
+
 def _probe(
     world: CollisionWorld,
     demonstration: Demonstration,
@@ -267,9 +273,9 @@ def _probe(
     steps, model = demonstration.steps, world.kinematics
     T_key, q_key = steps.measured_Ts_world_tool[t], steps.joint_positions[t]
     t_star = convergence_waypoint(demonstration, PrecisionSphere(t, T_key, radius))
-    moving = world.moving(t_star)
-    if moving is not None:
-        return f"{moving} moves at waypoint {t_star}"
+    unfit = _unfit(world, t_star)
+    if unfit is not None:
+        return f"{unfit} at waypoint {t_star}"
     pair = world.too_close(t_star, steps.commanded_joint_positions[t_star], config.margin)
     if pair is not None:
         return f"{pair} at waypoint {t_star}"

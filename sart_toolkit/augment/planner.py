@@ -57,6 +57,7 @@ class SegmentPlanner:
         steps = self.world.demonstration.steps
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
         T_goal = proposal.T_world_sampled
+        self.world.check_known(t)
         try:
             motion = straight_line(self.world.kinematics, q, T, T_goal, config.duration)
             certificate = self.world.certify(t, motion.path, config.margin)

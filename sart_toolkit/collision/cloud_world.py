@@ -29,10 +29,11 @@ _BESIDE = 0.03
 
 
 class _Seen(NamedTuple):
-    """The obstacles of a run of waypoints, and the parts of what is in the grasp there."""
+    """The obstacles of a run of waypoints, and what is in the grasp there, also as a part."""
 
     obstacles: CloudObstacles
-    grasped: tuple[ConvexPart, ...]
+    grasped: GraspedObject | None
+    part: ConvexPart | None
 
 
 class CloudWorld(CollisionWorld):
@@ -68,7 +69,8 @@ class CloudWorld(CollisionWorld):
         self._robot, self._held = robot, scene.held
         self._config = config or CloudConfig()
         self._collision = CollisionModel(robot, SceneSpec((), scene.held))
-        self._seen: dict[range, _Seen] = {}
+        self._looked: dict[range, _Seen] = {}
+        self._shapes: dict[range, GraspedObject | None] = {}
         self._placed: dict[int, PlacedModel] = {}
 
     @property
@@ -83,16 +85,13 @@ class CloudWorld(CollisionWorld):
             InvalidInput: the demonstration holds no depth pictures, or they show nothing near.
         """
         if t not in self._placed:
-            run = self._run(t)
-            if run not in self._seen:
-                self._seen[run] = self._look(run)
-            seen = self._seen[run]
+            seen = self._seen(self._run(t))
             self._placed[t] = self._collision.placed(
                 {},
                 # Openings that hardly differ share their parts, and the hulls of these.
                 round(self._opening(t), 2),
                 slip_tolerance=self.slip_tolerance,
-                grasped_parts=seen.grasped,
+                grasped_parts=() if seen.part is None else (seen.part,),
                 cloud=seen.obstacles,
             )
         return self._placed[t]
@@ -100,6 +99,11 @@ class CloudWorld(CollisionWorld):
     def moving(self, t: int) -> str | None:
         """Always `None`: pictures of one moment don't tell what moves."""
         return None
+
+    def unknown(self, t: int) -> str | None:
+        """That the shape of what is in the grasp at waypoint `t` was never seen, or None."""
+        known = not self.phases[t].grasped or self._seen(self._run(t)).grasped is not None
+        return None if known else f"{_GRASPED} not seen"
 
     def _run(self, t: int) -> range:
         """The waypoints about `t` in which nothing new is touched, grasped or let go."""
@@ -114,24 +118,55 @@ class CloudWorld(CollisionWorld):
             end += 1
         return range(first, end)
 
-    def _look(self, run: range) -> _Seen:
+    def _seen(self, run: range) -> _Seen:
         """What the pictures of a run of waypoints show."""
-        about = self.demonstration, self._robot, self._held
-        if not self.phases[run.start].grasped:
-            return _Seen(CloudObstacles(fuse_cloud(*about, run, self._config)), ())
-        before = self._run(0)
-        grasped = grasped_object(
-            *about, run, None if before == run else before, config=self._config
-        )
+        if run not in self._looked:
+            self._looked[run] = self._look(run)
+        return self._looked[run]
+
+    def _look(self, run: range) -> _Seen:
+        grasped = self._own_shape(run)
         if grasped is None:
-            return _Seen(CloudObstacles(fuse_cloud(*about, run, self._config)), ())
-        cloud = fuse_cloud(*about, run, self._config, (grasped,))
-        if run.start > 0:
-            grasped = self._down_to_support(grasped, cloud)
+            others = (o for o in self._same_grasp(run) if self._own_shape(o) is not None)
+            if (other := next(others, None)) is None:
+                return _Seen(CloudObstacles(self._fused(run)), None, None)
+            grasped = self._seen(other).grasped
+            assert grasped is not None
+            grasped = dataclasses.replace(grasped, waypoints=tuple(run))
+            cloud = self._fused(run, grasped)
+        else:
+            cloud = self._fused(run, grasped)
+            if run.start > 0:
+                grasped = self._down_to_support(grasped, cloud)
         T = self._collision.T_joint_tool
         points = grasped.points @ T[:3, :3].T + T[:3, 3]
         part = hull_part(_GRASPED, len(self._robot.arm_joints), points)
-        return _Seen(CloudObstacles(cloud), (part,))
+        return _Seen(CloudObstacles(cloud), grasped, part)
+
+    def _fused(self, run: range, *grasped: GraspedObject) -> SceneCloud:
+        about = self.demonstration, self._robot, self._held
+        return fuse_cloud(*about, run, self._config, grasped)
+
+    def _own_shape(self, run: range) -> GraspedObject | None:
+        """What was in the grasp in a run of waypoints, as its own pictures show it."""
+        if not self.phases[run.start].grasped:
+            return None
+        if run not in self._shapes:
+            about = self.demonstration, self._robot, self._held
+            first = self._run(0)
+            before = None if first == run else first
+            self._shapes[run] = grasped_object(*about, run, before, self._config)
+        return self._shapes[run]
+
+    def _same_grasp(self, run: range) -> list[range]:
+        """The other runs of waypoints with the same grasp all the way, the nearest first."""
+        grasped, runs = self.phases[run.start].grasped, []
+        if grasped:
+            for step, s in ((-1, run.start - 1), (1, run.stop)):
+                while 0 <= s < len(self.phases) and self.phases[s].grasped == grasped:
+                    runs.append(self._run(s))
+                    s = runs[-1].start - 1 if step < 0 else runs[-1].stop
+        return sorted(runs, key=lambda other: abs(other.start - run.start))
 
     def _down_to_support(self, grasped: GraspedObject, cloud: SceneCloud) -> GraspedObject:
         """What was lifted, with its unseen underside: it reached down to what it had stood on."""

@@ -12,7 +12,7 @@ from sart_toolkit.collision.cloud import CloudConfig
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.collision.phases import IN_GRASP_SLIP, demonstration_phases
 from sart_toolkit.data.records import Demonstration
-from sart_toolkit.errors import Mismatch, unknown_name
+from sart_toolkit.errors import Mismatch, MotionRejected, unknown_name
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
@@ -65,6 +65,22 @@ class CollisionWorld(ABC):
     def moving(self, t: int) -> str | None:
         """The name of an obstacle that is known not to stand still at waypoint `t`, or None."""
 
+    def unknown(self, t: int) -> str | None:
+        """What isn't known at waypoint `t`, so that nothing can be proved there, or None."""
+        return None
+
+    def check_known(self, t: int) -> None:
+        """Return if all is known that proofs at waypoint `t` are about.
+
+        Raises:
+            MotionRejected: something isn't.
+        """
+        unknown = self.unknown(t)
+        if unknown is not None:
+            raise MotionRejected(
+                f"{unknown}: nothing can be proved at waypoint {t}; choose other waypoints"
+            )
+
     def too_close(self, t: int, q: Array, margin: float) -> str | None:
         """The names of the nearest pair at joints `q (n,)` if it is nearer than the margin [m].
 
@@ -78,8 +94,10 @@ class CollisionWorld(ABC):
         """A proof that a joint path keeps clear of the obstacles of waypoint `t`, or where not.
 
         Raises:
+            MotionRejected: not all is known that there is at the waypoint.
             InvalidInput: the margin is negative, or the path not finite.
         """
+        self.check_known(t)
         return certify(self.placed(t), path, margin)
 
     def _opening(self, t: int) -> float:

@@ -11,11 +11,13 @@ from sart_toolkit.annotate.suggest import (
     suggest_radius,
 )
 from sart_toolkit.backends import make_backend
+from sart_toolkit.collision import cloud_world
 from sart_toolkit.collision.cloud import CloudConfig
 from sart_toolkit.collision.cloud_world import CloudWorld
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.phases import IN_GRASP_SLIP
-from sart_toolkit.errors import InvalidInput
+from sart_toolkit.errors import InvalidInput, MotionRejected
+from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.poses import pose
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
@@ -118,3 +120,30 @@ def test_without_depth_there_is_no_cloud(peg):
     world = CloudWorld(blind, peg.robot, peg.task.scene)
     with pytest.raises(InvalidInput, match="camera"):
         suggest_radius(world, blind, 0)
+
+
+def test_a_shape_that_was_seen_at_another_time_of_the_same_grasp_counts_too(toolbox):
+    """While it still touches the table the tool hasn't moved enough to tell it from the table."""
+    phases = toolbox.cloud.phases
+    first = next(t for t, phase in enumerate(phases) if phase.grasped)
+    lifted = next(t for t in range(first, len(phases)) if not phases[t].contacts)
+    assert phases[first].contacts and phases[first].grasped == phases[lifted].grasped
+    shapes = []
+    for t in (first, lifted + 3):
+        assert toolbox.cloud.unknown(t) is None
+        (part,) = [p for p in toolbox.cloud.placed(t).parts if p.body == "grasped object"]
+        shapes.append(part.points)
+    np.testing.assert_allclose(*shapes)
+
+
+def test_nothing_is_proved_of_a_grasp_whose_object_was_never_seen(toolbox, monkeypatch):
+    monkeypatch.setattr(cloud_world, "grasped_object", lambda *args: None)
+    world = CloudWorld(toolbox.demonstration, toolbox.robot, toolbox.task.scene)
+    last = len(world.phases) - 3
+    assert world.unknown(0) is None and world.phases[last].grasped
+    found = suggest_radius(world, toolbox.demonstration, last)
+    assert (found.radius, found.limited_by) == (0.0, "grasped object not seen")
+    path = PolylinePath(toolbox.demonstration.steps.joint_positions[last : last + 2])
+    with pytest.raises(MotionRejected, match="grasped object not seen: nothing can be proved at w"):
+        world.certify(last, path)
+    assert world.certify(0, PolylinePath(world.demonstration.steps.joint_positions[:3]))
