@@ -88,8 +88,7 @@ class CloudWorld(CollisionWorld):
             seen = self._seen(self._run(t))
             self._placed[t] = self._collision.placed(
                 {},
-                # Openings that hardly differ share their parts, and the hulls of these.
-                round(self._opening(t), 2),
+                self._opening(t),
                 slip_tolerance=self.slip_tolerance,
                 grasped_parts=() if seen.part is None else (seen.part,),
                 cloud=seen.obstacles,
