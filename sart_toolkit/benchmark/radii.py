@@ -110,7 +110,7 @@ class SphereTrial:
 
         `collisions` counts poses at which one of the two models of the whole robot overlaps, with
         what is carried where it was in the grasp. `within_margin` tells whether a directed draw
-        came nearer than the margin, and the play in the grasp, that a suggested radius leaves.
+        came nearer than the margin, and the slip tolerance, that a suggested radius leaves.
         """
         t = sphere.waypoint
         self._checker.place(*self._world.at(t))
@@ -204,7 +204,7 @@ class SphereTrial:
             "draws": search.draws,
             "collided": found,
             "least_mm": search.least * 1e3,
-            "within_margin": bool(search.least_with_play < self._config.suggest.margin),
+            "within_margin": bool(search.least_with_slip < self._config.suggest.margin),
         }
 
 
@@ -256,7 +256,7 @@ class _Search:
                 self._aims.append((gap / length, points, weights / weights.sum()))
         self.draws = 0
         self._best = np.zeros(3), np.zeros(3)
-        self.least = self.least_with_play = float("inf")
+        self.least = self.least_with_slip = float("inf")
 
     def draw(self) -> tuple[float, Array]:
         """The next draw: how far [m] the tool is from the scene there, and its pose `(4, 4)`."""
@@ -267,12 +267,12 @@ class _Search:
         T[:3, :3] = exp_rotation(w) @ T[:3, :3]
         T[:3, 3] += p
         distances = [
-            (convex_distance(a, coal_transform(T @ T_tool_part), b, T_b), play)
-            for a, T_tool_part, b, T_b, play in self._pairs
+            (convex_distance(a, coal_transform(T @ T_tool_part), b, T_b), slip)
+            for a, T_tool_part, b, T_b, slip in self._pairs
         ]
         least = min(distance for distance, _ in distances)
-        self.least_with_play = min(
-            self.least_with_play, *(distance - play for distance, play in distances)
+        self.least_with_slip = min(
+            self.least_with_slip, *(distance - slip for distance, slip in distances)
         )
         if least < self.least:
             self.least, self._best = least, (p, w)
