@@ -9,15 +9,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sart_toolkit.annotate.suggest import ExactSurroundings, SuggestConfig, suggest_annotation
+    from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.engine import augment_demonstration, augment_sources
     from sart_toolkit.augment.strategies import Proposal, Strategy
     from sart_toolkit.augment.validate import validate_dataset
     from sart_toolkit.backends import make_backend
     from sart_toolkit.collision.certificate import certify
-    from sart_toolkit.collision.demonstrated import DemonstratedScene
+    from sart_toolkit.collision.cloud_world import CloudWorld
+    from sart_toolkit.collision.exact import ExactWorld
     from sart_toolkit.collision.model import CollisionModel
+    from sart_toolkit.collision.world import CollisionWorld, make_world
     from sart_toolkit.data.assets import asset
     from sart_toolkit.data.dataset import load_dataset
     from sart_toolkit.data.sampling import SamplingConfig
@@ -43,10 +45,11 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "AugmentConfig": "augment.config",
+    "CloudWorld": "collision.cloud_world",
     "CollisionModel": "collision.model",
-    "DemonstratedScene": "collision.demonstrated",
+    "CollisionWorld": "collision.world",
     "EvaluateConfig": "evaluate.rollout",
-    "ExactSurroundings": "annotate.suggest",
+    "ExactWorld": "collision.exact",
     "Placement": "tasks.task",
     "Proposal": "augment.strategies",
     "RobotModel": "robots.model",
@@ -68,6 +71,7 @@ _HOMES = {
     "load_demonstration": "data.storage",
     "load_skill": "learn.skill",
     "make_backend": "backends",
+    "make_world": "collision.world",
     "record_demonstration": "record.session",
     "replay_demonstration": "record.replay",
     "save_annotation": "data.storage",
@@ -81,10 +85,11 @@ _HOMES = {
 }
 __all__ = [
     "AugmentConfig",
+    "CloudWorld",
     "CollisionModel",
-    "DemonstratedScene",
+    "CollisionWorld",
     "EvaluateConfig",
-    "ExactSurroundings",
+    "ExactWorld",
     "Placement",
     "Proposal",
     "RobotModel",
@@ -106,6 +111,7 @@ __all__ = [
     "load_demonstration",
     "load_skill",
     "make_backend",
+    "make_world",
     "record_demonstration",
     "replay_demonstration",
     "save_annotation",

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import make_backend
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.record.scripted import ScriptedOperator
@@ -102,15 +102,15 @@ def peg_demonstration(
 
 
 @pytest.fixture(scope="session")
-def peg_scene(peg_task: Task, peg_demonstration: Demonstration) -> DemonstratedScene:
+def peg_world(peg_task: Task, peg_demonstration: Demonstration) -> ExactWorld:
     """Collision models of `peg_demonstration`'s waypoints."""
-    return DemonstratedScene(peg_demonstration, get_robot(peg_task.robot), peg_task.scene)
+    return ExactWorld(peg_demonstration, get_robot(peg_task.robot), peg_task.scene)
 
 
 @pytest.fixture(scope="session")
-def peg_annotation(peg_demonstration: Demonstration, peg_scene: DemonstratedScene) -> Annotation:
+def peg_annotation(peg_demonstration: Demonstration, peg_world: ExactWorld) -> Annotation:
     """The spheres suggested for `peg_demonstration`."""
-    return suggest_annotation(peg_demonstration, ExactSurroundings(peg_scene))
+    return suggest_annotation(peg_demonstration, peg_world)
 
 
 @pytest.fixture(scope="session")

@@ -28,14 +28,14 @@ from numpy.typing import NDArray
 
 from sart_toolkit import doctor
 from sart_toolkit.annotate.session import AnnotationSession
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.cloud import fuse_cloud
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
@@ -548,8 +548,8 @@ def augmentation(
     plan = task.plan(task.initial_state(model, Placement()))
     operator = ScriptedOperator(plan, np.random.default_rng(0))
     demonstration = record_demonstration(make(), task, model, operator)
-    scene = DemonstratedScene(demonstration, robot, task.scene)
-    return demonstration, suggest_annotation(demonstration, ExactSurroundings(scene)), make
+    world = ExactWorld(demonstration, robot, task.scene)
+    return demonstration, suggest_annotation(demonstration, world), make
 
 
 # --- certificates -------------------------------------------------------------------------------
@@ -850,7 +850,7 @@ def bench_annotate(arguments: Sequence[str]) -> dict[str, Any]:
     backend = make_backend("pybullet", robot, task.scene, 128)
     demonstration = record_demonstration(backend, task, model, operator)
     backend.close()
-    scene = DemonstratedScene(demonstration, robot, task.scene)
+    scene = ExactWorld(demonstration, robot, task.scene)
     keys = _KEYS * options.repeats
     cold = _session_ms(_session(demonstration, scene), keys)
     session = _session(demonstration, scene)
@@ -870,8 +870,8 @@ def bench_annotate(arguments: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _session(demonstration: Demonstration, scene: DemonstratedScene) -> AnnotationSession:
-    session = AnnotationSession(demonstration, ExactSurroundings(scene))
+def _session(demonstration: Demonstration, scene: ExactWorld) -> AnnotationSession:
+    session = AnnotationSession(demonstration, scene)
     _ = session.clearances
     return session
 
@@ -931,7 +931,7 @@ def _show_window(folder: Path, points: int) -> None:
 
     demonstration = load_demonstration(folder / "demo.h5")
     task, robot = get_task(demonstration.task), get_robot(demonstration.robot)
-    session = _session(demonstration, DemonstratedScene(demonstration, robot, task.scene))
+    session = _session(demonstration, ExactWorld(demonstration, robot, task.scene))
     cloud = fuse_cloud(demonstration, robot, task.scene.held)
     rng = np.random.default_rng(0)
     rows = rng.integers(len(cloud), size=points)

@@ -28,6 +28,7 @@ from PIL import Image
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.backends import make_backend
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.records import Annotation, Demonstration, PrecisionSphere
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import MotionRejected, SartError, Unreachable
@@ -124,11 +125,10 @@ def _draw_picture(out: Path, draws: int) -> dict[str, Any]:
     )
     T_key = shown.steps.measured_Ts_world_tool[0]
     annotation = Annotation((PrecisionSphere(0, T_key, _RADIUS),), shown.content_hash())
+    world = ExactWorld(shown, robot, task.scene)
     planners = {
         name: SegmentPlanner(
-            robot,
-            task.scene,
-            shown,
+            world,
             annotation,
             AugmentConfig(strategy=name, sampling=SamplingConfig("area"), camera=None),
         )
@@ -182,7 +182,7 @@ def _outcome(planner: SegmentPlanner, k: int) -> _Draw:
         return _Draw(p_sampled, None, reason, False, time.perf_counter() - started)
     seconds = time.perf_counter() - started
     certificate.check_free()
-    fk = planner.scene.collision.kinematics.fk
+    fk = planner.world.kinematics.fk
     way = np.array([fk(q)[:3, 3] for q in motion.path.positions(np.linspace(0, 1, _POINTS))])
     line = way[0] + np.linspace(0, 1, _POINTS)[:, None] * (way[-1] - way[0])
     straight = bool(np.linalg.norm(way - line, axis=1).max() < 1e-3)

@@ -24,8 +24,8 @@ def main(out: Path, n: int = 40, epochs: int = 60, rollouts: int = 20) -> None:
     demo = sart.record_demonstration(make_backend(), task, model, operator)
 
     # How far the tool may stray, from the scene's geometry; then the robot explores by itself.
-    surroundings = sart.ExactSurroundings(sart.DemonstratedScene(demo, robot, task.scene))
-    annotation = sart.suggest_annotation(demo, surroundings)
+    world = sart.ExactWorld(demo, robot, task.scene)
+    annotation = sart.suggest_annotation(demo, world)
     dataset = sart.augment_demonstration(
         demo, annotation, make_backend, out / "dataset", sart.AugmentConfig(n=n)
     )

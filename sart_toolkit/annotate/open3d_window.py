@@ -216,7 +216,7 @@ class AnnotationWindow:
         waited = time.monotonic() - self._last_key
         if self._moving and waited > self._config.idle_s:
             self._moving = False
-            self._show_surroundings()
+            self._show_obstacles()
             self._draw_governing()
             self._window.post_redraw()
         elif not self._moving:
@@ -264,7 +264,7 @@ class AnnotationWindow:
             T = session.demonstration.body_Ts_world[body][t]
             scene.set_geometry_transform(name, T)
         scene.set_geometry_transform("triad", steps.measured_Ts_world_tool[t])
-        self._show_surroundings()
+        self._show_obstacles()
         self._draw_spheres()
         self._draw_governing()
         self._panel.update()
@@ -275,7 +275,7 @@ class AnnotationWindow:
             self._look_at(steps.measured_Ts_world_tool[t][:3, 3], 0.45)
         self._window.post_redraw()
 
-    def _show_surroundings(self) -> None:
+    def _show_obstacles(self) -> None:
         scene, clouds = self._view.scene, self._session.shown == "cloud" and bool(self._clouds)
         for name in self._clouds:
             scene.show_geometry(name, clouds and name == ("thin" if self._moving else "whole"))

@@ -18,10 +18,11 @@ import numpy as np
 from sart_toolkit.annotate.suggest import (
     SuggestConfig,
     Suggestion,
-    Surroundings,
+    proved_radius,
     suggest_annotation,
     suggest_radius,
 )
+from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import (
     Annotation,
     Demonstration,
@@ -115,7 +116,7 @@ class AnnotationSession:
     def __init__(
         self,
         demonstration: Demonstration,
-        surroundings: Surroundings,
+        world: CollisionWorld,
         config: AnnotateConfig | None = None,
         annotation: Annotation | None = None,
         out: Path | None = None,
@@ -126,7 +127,7 @@ class AnnotationSession:
 
         Args:
             demonstration: what was shown.
-            surroundings: where the obstacles are.
+            world: where the obstacles are.
             config: what the keys do.
             annotation: to go on with.
             out: file to save to.
@@ -153,7 +154,7 @@ class AnnotationSession:
         self.shown: Literal["cloud", "scene"] = "cloud"
         self.follow = False
         self.view_resets = 0
-        self._surroundings = surroundings
+        self._world = world
         self._hash = demonstration.content_hash()
         self._base = self._saved = self.spheres
         self._base_settings = {} if annotation is None else annotation.settings
@@ -209,7 +210,7 @@ class AnnotationSession:
         """The largest radius about waypoint `t` that is proved clear, computed once."""
         if t not in self._found:
             config = dataclasses.replace(self.config.suggest, min_radius=self.config.smallest)
-            self._found[t] = suggest_radius(self._surroundings, self.demonstration, t, config)
+            self._found[t] = suggest_radius(self._world, self.demonstration, t, config)
         return self._found[t]
 
     def verdict(self, sphere: PrecisionSphere) -> Verdict:
@@ -234,7 +235,7 @@ class AnnotationSession:
         """How far `(T,)` [m] the tool was from the nearest obstacle at each waypoint."""
         # Told of the nearest pair where a radius as small as this fits.
         config = SuggestConfig(margin=1e-6, min_radius=1e-6, max_radius=1e-6)
-        found = [self._surroundings.proved(t, config).clearance for t in range(self.last + 1)]
+        found = [proved_radius(self._world, t, config).clearance for t in range(self.last + 1)]
         return np.array([np.inf if x is None else x for x in found])
 
     def ghosts(self, sphere: PrecisionSphere) -> Array:
@@ -247,8 +248,8 @@ class AnnotationSession:
     def state(self) -> dict[str, str]:
         """The selected waypoint in words, by what each line is about."""
         t, steps = self.selected, self.demonstration.steps
-        phase = self._surroundings.phases[t]
-        doing = [f"holds {', '.join(sorted(phase.carried))}"] if phase.carried else []
+        phase = self._world.phases[t]
+        doing = [f"holds {', '.join(sorted(phase.grasped))}"] if phase.grasped else []
         doing += [f"touches {' / '.join(min(phase.contacts))}"] if phase.contacts else []
         lines = {
             "waypoint": f"{t} of {self.last}, {self.demonstration.timestamps[t]:.1f} s",
@@ -451,7 +452,7 @@ class AnnotationSession:
         """The suggested sphere about the selected waypoint."""
         self._may_start()
         config = dataclasses.replace(self.config.suggest, min_radius=self.config.smallest)
-        found = suggest_annotation(self.demonstration, self._surroundings, [self.selected], config)
+        found = suggest_annotation(self.demonstration, self._world, [self.selected], config)
         return found.spheres[0]
 
     def _suggest(self) -> str:
@@ -472,7 +473,7 @@ class AnnotationSession:
         """The spheres that tile the demonstration, or why there are none."""
         try:
             return suggest_annotation(
-                self.demonstration, self._surroundings, None, self.config.suggest
+                self.demonstration, self._world, None, self.config.suggest
             ).spheres
         except InvalidInput as error:
             return error

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.stats import qmc
 
-from sart_toolkit.collision.demonstrated import DemonstratedScene, Phase
-from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.collision.model import PairDistance, PlacedModel
+from sart_toolkit.collision.phases import Phase
+from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import (
     ROTATION_PER_METRE,
     Annotation,
@@ -21,7 +21,7 @@ from sart_toolkit.data.records import (
     convergence_waypoint,
 )
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
-from sart_toolkit.poses import Array, check_positive, distance, pose
+from sart_toolkit.poses import Array, check_positive, pose
 from sart_toolkit.robots.model import RobotModel
 
 _BISECTIONS = 40
@@ -32,9 +32,7 @@ _SHRINK = 0.9
 _JOINT_MARGIN = 0.05
 _LEAST_SINGULAR_VALUE = 0.03
 _LARGEST_STEP = 1.5
-# What moves no farther than this in 0.2 s stands still [m, deg].
-_STILL, _STILL_DEG = 0.0005, 0.2
-# Pairs without a proof keep this [m] more at the draws that are aimed at them.
+# Unproven pairs keep this [m] more at the draws that are aimed at them.
 _ARM_MARGIN = 0.005
 # By this many radii, at most, two bodies come nearer within a sphere; by half that usually.
 _STEEPEST = 5.0
@@ -102,6 +100,19 @@ class Gap:
     points: Array
     support: float
 
+    @staticmethod
+    def of(placed: PlacedModel, pair: int, found: PairDistance, T_world_joint: Array) -> Gap:
+        """The gap of a tool body's pair, its last arm joint being at `T_world_joint (4, 4)`."""
+        p_tool = (T_world_joint @ placed.T_joint_tool)[:3, 3]
+        normal = found.p_a - found.p_b
+        length = float(np.linalg.norm(normal))
+        # Bodies that touch have no plane between them; nothing fits then.
+        normal = normal / length if length > 1e-9 else np.zeros(3)
+        part = placed.parts[placed.pairs[pair][0]]
+        points = part.points @ T_world_joint[:3, :3].T + T_world_joint[:3, 3] - p_tool
+        support = float(normal @ (found.p_b - p_tool)) + float(placed.slip[pair])
+        return Gap(found.a, found.b, found.distance, normal, points, support)
+
     def fits(self, radius: float, margin: float, rotation_per_metre: float) -> bool:
         """Whether the part keeps `margin` [m] at every pose within `radius` and nu radius.
 
@@ -167,104 +178,40 @@ def certified_radius(gap: Gap, margin: float, rotation_per_metre: float, largest
     return low
 
 
-class Surroundings(Protocol):
-    """What radii are suggested from: where obstacles are at each waypoint, however it is known.
+def proved_radius(world: CollisionWorld, t: int, config: SuggestConfig) -> Suggestion:
+    """The largest radius about waypoint `t` for which the tool is proved clear of obstacles.
 
-    Attributes:
-        kinematics: the robot.
-        phases: the phase of each waypoint.
+    Args:
+        world: where the obstacles are.
+        t: the waypoint.
+        config: margins and limits.
     """
-
-    kinematics: RobotModel
-    phases: tuple[Phase, ...]
-
-    def placed(self, t: int) -> PlacedModel:
-        """The robot, and what else of the scene is known exactly, as at waypoint `t`."""
-
-    def proved(self, t: int, config: SuggestConfig) -> Suggestion:
-        """The largest radius about waypoint `t` for which the tool is proved clear of obstacles."""
-
-    def too_close(self, t: int, q: Array, margin: float) -> str | None:
-        """The names of a pair of the whole robot, the scene as at `t`, nearer than the margin."""
-
-    def moving(self, t: int) -> str | None:
-        """The name of an obstacle that doesn't stand still at waypoint `t`."""
-
-
-class ExactSurroundings:
-    """Obstacles as the simulated scene has them."""
-
-    def __init__(self, scene: DemonstratedScene) -> None:
-        """Take the scene's bodies from where the demonstration has them."""
-        self._scene = scene
-        self.kinematics = scene.collision.kinematics
-        self.phases = scene.phases
-
-    def placed(self, t: int) -> PlacedModel:
-        """Robot and scene as at waypoint `t`."""
-        return self._scene.placed(t)
-
-    def gaps(self, t: int) -> Iterator[Gap]:
-        """Tool parts and obstacles at waypoint `t`, nearest first."""
-        placed = self._scene.placed(t)
-        q = self._scene.demonstration.steps.joint_positions[t]
-        pairs = placed.tool_pairs()
-        distances = np.array(placed.pair_distances(q, pairs))
-        T_joint = placed.joint_poses(q)[-1]
-        p_tool = (T_joint @ placed.T_joint_tool)[:3, 3]
-        for i in np.argsort(distances, kind="stable"):
-            found = placed.witness(q, pairs[i])
-            part = placed.parts[placed.pairs[pairs[i]][0]]
-            normal = found.p_a - found.p_b
-            length = float(np.linalg.norm(normal))
-            # Bodies that touch have no plane between them; nothing fits then.
-            normal = normal / length if length > 1e-9 else np.zeros(3)
-            points = part.points @ T_joint[:3, :3].T + T_joint[:3, 3] - p_tool
-            support = float(normal @ (found.p_b - p_tool)) + float(placed.play[pairs[i]])
-            yield Gap(found.a, found.b, found.distance, normal, points, support)
-
-    def proved(self, t: int, config: SuggestConfig) -> Suggestion:
-        """The largest radius about waypoint `t` for which the tool is proved clear of obstacles."""
-        placed, nu = self._scene.placed(t), config.rotation_per_metre
-        last = len(self.kinematics.spec.arm_joints)
-        tool = [part.points for part in placed.parts if part.joint == last]
-        p_tool = placed.T_joint_tool[:3, 3]
-        reach = float(np.linalg.norm(np.concatenate(tool) - p_tool, axis=1).max())
-        best = Suggestion(config.max_radius, None, "max_radius")
-        for gap in self.gaps(t):
-            if best.clearance is None:
-                best = dataclasses.replace(best, clearance=gap.distance)
-            # No point of the tool comes as far as the pairs from here on.
-            swept = best.radius + 2 * reach * np.sin(min(nu * best.radius, np.pi) / 2)
-            if gap.distance >= swept + config.margin:
-                break
-            best = gap.limited(best, config)
-        return best
-
-    def too_close(self, t: int, q: Array, margin: float) -> str | None:
-        """The names of a pair of the whole robot, the scene as at `t`, nearer than the margin."""
-        pair = self._scene.placed(t).too_close(q, margin)
-        return None if pair is None else " / ".join(pair)
-
-    def moving(self, t: int) -> str | None:
-        """The name of a body that doesn't stand still at waypoint `t`; a carried one may move."""
-        bodies = self._scene.demonstration.body_Ts_world
-        before, after = max(t - 1, 0), min(t + 1, len(self.phases) - 1)
-        for name, Ts in bodies.items():
-            if name in self.phases[t].carried or name in self._held:
-                continue
-            far, turn = distance(Ts[before], Ts[after])
-            if far > _STILL or turn > np.deg2rad(_STILL_DEG):
-                return name
-        return None
-
-    @functools.cached_property
-    def _held(self) -> frozenset[str]:
-        return frozenset(body.name for body in self._scene.collision.scene.held)
+    placed, nu = world.placed(t), config.rotation_per_metre
+    q = world.demonstration.steps.joint_positions[t]
+    T_world_joint = placed.joint_poses(q)[-1]
+    last = len(world.kinematics.spec.arm_joints)
+    tool = [part.points for part in placed.parts if part.joint == last]
+    p_tool = placed.T_joint_tool[:3, 3]
+    reach = float(np.linalg.norm(np.concatenate(tool) - p_tool, axis=1).max())
+    best = Suggestion(config.max_radius, None, "max_radius")
+    pairs = placed.tool_pairs()
+    distances = np.array(placed.pair_distances(q, pairs))
+    for i in np.argsort(distances, kind="stable"):
+        if best.clearance is None:
+            best = dataclasses.replace(best, clearance=float(distances[i]))
+        # No point of the tool comes as far as the pairs from here on.
+        swept = best.radius + 2 * reach * np.sin(min(nu * best.radius, np.pi) / 2)
+        if distances[i] >= swept + config.margin:
+            break
+        # Any point of a cloud that is farther away than this leaves more room than the nearest.
+        within = nu * reach * max(float(distances[i]), 0.0)
+        for found in placed.witnesses(q, pairs[i], within):
+            best = Gap.of(placed, pairs[i], found, T_world_joint).limited(best, config)
+    return best
 
 
 def suggest_radius(
-    surroundings: Surroundings,
+    world: CollisionWorld,
     demonstration: Demonstration,
     t: int,
     config: SuggestConfig | None = None,
@@ -276,7 +223,7 @@ def suggest_radius(
     `probes` extreme poses, and the radius shrunk until all pass.
 
     Args:
-        surroundings: where the obstacles are.
+        world: where the obstacles are.
         demonstration: what was shown.
         t: the key waypoint.
         config: margins and limits.
@@ -287,47 +234,53 @@ def suggest_radius(
     config = config or SuggestConfig()
     if not 0 <= t < len(demonstration) - 1:
         raise InvalidInput(f"waypoint {t}: expected 0 to {len(demonstration) - 2}; choose another")
-    room = _room_before_event(demonstration, surroundings.phases, t)
+    room = _room_before_event(demonstration, world.phases, t)
     if room is not None and room.radius < config.min_radius:
         return room
-    moving = surroundings.moving(t)
-    if moving is not None:
-        return Suggestion(0.0, None, f"{moving} moves")
-    best = surroundings.proved(t, config)
+    unfit = _unfit(world, t)
+    if unfit is not None:
+        return Suggestion(0.0, None, unfit)
+    best = proved_radius(world, t, config)
     if room is not None and room.radius < best.radius:
         best = dataclasses.replace(room, clearance=best.clearance)
     if best.radius < config.min_radius:
         return dataclasses.replace(best, radius=0.0)
     q_key = demonstration.steps.joint_positions[t]
-    threats = _threats(surroundings.placed(t), q_key, _STEEPEST * best.radius + _ARM_MARGIN)
+    unproven = _unproven_pairs(world.placed(t), q_key, _STEEPEST * best.radius + _ARM_MARGIN)
     while best.radius >= config.min_radius:
-        problem = _probe(surroundings, demonstration, t, best.radius, config, threats)
+        problem = _probe(world, demonstration, t, best.radius, config, unproven)
         if problem is None:
             return best
         best = Suggestion(best.radius * _SHRINK, best.clearance, problem)
     return Suggestion(0.0, best.clearance, best.limited_by)
 
 
+def _unfit(world: CollisionWorld, t: int) -> str | None:
+    """Why nothing can be proved at waypoint `t`, or None."""
+    moving = world.moving(t)
+    return world.unknown(t) if moving is None else f"{moving} moves"
+
+
 def _probe(
-    surroundings: Surroundings,
+    world: CollisionWorld,
     demonstration: Demonstration,
     t: int,
     radius: float,
     config: SuggestConfig,
-    threats: Sequence[_Threat],
+    unproven: Sequence[_UnprovenPair],
 ) -> str | None:
     """What goes wrong at one of the extreme poses of a radius, or at its t*; or None."""
-    steps, model = demonstration.steps, surroundings.kinematics
+    steps, model = demonstration.steps, world.kinematics
     T_key, q_key = steps.measured_Ts_world_tool[t], steps.joint_positions[t]
     t_star = convergence_waypoint(demonstration, PrecisionSphere(t, T_key, radius))
-    moving = surroundings.moving(t_star)
-    if moving is not None:
-        return f"{moving} moves at waypoint {t_star}"
-    pair = surroundings.too_close(t_star, steps.commanded_joint_positions[t_star], config.margin)
+    unfit = _unfit(world, t_star)
+    if unfit is not None:
+        return f"{unfit} at waypoint {t_star}"
+    pair = world.too_close(t_star, steps.commanded_joint_positions[t_star], config.margin)
     if pair is not None:
         return f"{pair} at waypoint {t_star}"
     reached = functools.partial(_reached, model, T_key, q_key, radius, config)
-    problem = _directed(surroundings.placed(t), threats, q_key, radius, config, reached)
+    problem = _directed(world.placed(t), unproven, q_key, radius, config, reached)
     if problem is not None:
         return problem
     # The arm hardly moves in a small sphere.
@@ -336,7 +289,7 @@ def _probe(
         q = reached(direction, axis)
         if isinstance(q, str):
             return q
-        pair = surroundings.too_close(t, q, config.margin)
+        pair = world.too_close(t, q, config.margin)
         if pair is not None:
             return pair
     return None
@@ -369,7 +322,7 @@ def _reached(
 
 
 @dataclass(frozen=True)
-class _Threat:
+class _UnprovenPair:
     """Two bodies without a proof: their nearest pair by index, how the tool's motion changes it.
 
     `distance` [m] is that at the waypoint, `slope (6,)` its gradient by the tool's motion (linear,
@@ -392,27 +345,29 @@ class _Threat:
         return float(np.linalg.norm(self.slope[3:]))
 
     @staticmethod
-    def of(placed: PlacedModel, pair: int, distance: float, q: Array) -> _Threat:
+    def of(placed: PlacedModel, pair: int, distance: float, q: Array) -> _UnprovenPair:
         # The tool's motion is J dq.
         slope = np.linalg.solve(placed.kinematics.jacobian(q).T, placed.gradient(q, pair))
-        return _Threat(placed.names(pair), pair, distance, np.asarray(slope, dtype=np.float64))
+        return _UnprovenPair(
+            placed.names(pair), pair, distance, np.asarray(slope, dtype=np.float64)
+        )
 
 
-def _threats(placed: PlacedModel, q_key: Array, within: float) -> list[_Threat]:
+def _unproven_pairs(placed: PlacedModel, q_key: Array, within: float) -> list[_UnprovenPair]:
     """Every two bodies `within` [m] that have no proof, arm against arm, say, as at a waypoint."""
     proved = set(placed.tool_pairs())
-    unproved = [k for k in range(len(placed.pairs)) if k not in proved]
-    distances = dict(zip(unproved, placed.pair_distances(q_key, unproved), strict=True))
+    unproven = [k for k in placed.near_pairs(q_key, within) if k not in proved]
+    distances = dict(zip(unproven, placed.pair_distances(q_key, unproven), strict=True))
     nearest: dict[tuple[str, str], int] = {}
-    for k in sorted(unproved, key=lambda k: distances[k], reverse=True):
+    for k in sorted(unproven, key=lambda k: distances[k], reverse=True):
         nearest[placed.names(k)] = k
     near = [k for k in nearest.values() if distances[k] <= within]
-    return [_Threat.of(placed, k, distances[k], q_key) for k in near]
+    return [_UnprovenPair.of(placed, k, distances[k], q_key) for k in near]
 
 
 def _directed(
     placed: PlacedModel,
-    threats: Sequence[_Threat],
+    unproven: Sequence[_UnprovenPair],
     q_key: Array,
     radius: float,
     config: SuggestConfig,
@@ -425,16 +380,16 @@ def _directed(
     """
     angle = config.rotation_per_metre * radius
 
-    def approach(threat: _Threat) -> float:
+    def approach(each: _UnprovenPair) -> float:
         """By how much [m] the pair comes nearer within the sphere, by its slope."""
-        return threat.straight * radius + threat.turning * angle
+        return each.straight * radius + each.turning * angle
 
     # The likeliest first: a radius that is too large is then soon found to be.
-    for threat in sorted(threats, key=lambda threat: threat.distance - approach(threat)):
-        aimed, q = threat, q_key
+    for each in sorted(unproven, key=lambda each: each.distance - approach(each)):
+        aimed, q = each, q_key
         for _ in range(2):
             # Nowhere near, even if it all got twice as steep.
-            if threat.distance > 2 * approach(aimed) + _ARM_MARGIN:
+            if each.distance > 2 * approach(aimed) + _ARM_MARGIN:
                 break
             R = placed.kinematics.fk(q)[:3, :3]
             found = reached(
@@ -445,12 +400,12 @@ def _directed(
                 # What can't be reached can't collide.
                 break
             q = found
-            distance = placed.pair_distances(q, [threat.pair])[0]
+            distance = placed.pair_distances(q, [each.pair])[0]
             if distance < config.margin + _ARM_MARGIN:
-                return " / ".join(threat.names)
-            if distance > threat.distance / 2:
+                return " / ".join(each.names)
+            if distance > each.distance / 2:
                 break
-            aimed = _Threat.of(placed, threat.pair, threat.distance, q)
+            aimed = _UnprovenPair.of(placed, each.pair, each.distance, q)
     return None
 
 
@@ -490,12 +445,12 @@ def _room_before_event(
 
 def suggest_annotation(
     demonstration: Demonstration,
-    surroundings: Surroundings,
+    world: CollisionWorld,
     waypoints: Sequence[int] | None = None,
     config: SuggestConfig | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Annotation:
-    """Precision spheres for a demonstration, their radii from its surroundings.
+    """Precision spheres for a demonstration, their radii from where its obstacles were.
 
     Without `waypoints`, spheres tile the free part: the first at the start, each next one at the
     convergence waypoint of the one before, or at the first later waypoint with room for
@@ -504,7 +459,7 @@ def suggest_annotation(
 
     Args:
         demonstration: what was shown.
-        surroundings: where the obstacles were.
+        world: where the obstacles were.
         waypoints: key waypoints, or `None` to choose them.
         config: margins and limits.
         progress: called with the waypoint reached.
@@ -516,7 +471,7 @@ def suggest_annotation(
     last = len(demonstration) - 1
 
     def sphere_at(t: int) -> tuple[Suggestion, PrecisionSphere | None]:
-        found = suggest_radius(surroundings, demonstration, t, config)
+        found = suggest_radius(world, demonstration, t, config)
         if progress is not None:
             progress(t)
         if found.radius < config.min_radius:

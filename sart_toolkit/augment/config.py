@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.augment.strategies import Strategy, get_strategy, strategy_name
-from sart_toolkit.collision.demonstrated import GRASP_PLAY
+from sart_toolkit.collision.phases import IN_GRASP_SLIP
+from sart_toolkit.collision.world import SOURCES, Source
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
@@ -25,7 +26,8 @@ class AugmentConfig:
     `n`: trajectories in all, the demonstrations among them; how the spheres share the others tells
     `quotas`, their weights being their radii, or with `allocation` "equal" all the same, as in the
     paper. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
-    proved to keep `margin` [m] free, even if what is grasped slips by `slip_tolerance` [m]; if any
+    proved to keep `margin` [m] free of the `obstacles`, the bodies of the scene or the cloud that
+    the demonstration's cameras saw, even if what is grasped slips by `slip_tolerance` [m]; if any
     point of it moves farther in the grasp the segment is rejected. `camera`: whose pictures are
     recorded, `None` for none. `executor`: how segments are carried out.
     """
@@ -36,7 +38,8 @@ class AugmentConfig:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     duration: float = 2.0
     margin: float = 0.0002
-    slip_tolerance: float = GRASP_PLAY
+    slip_tolerance: float = IN_GRASP_SLIP
+    obstacles: Source = "scene"
     seed: int = 0
     camera: str | None = "wrist"
     executor: str = "restore"
@@ -48,6 +51,8 @@ class AugmentConfig:
             raise InvalidInput(f"seed: expected a whole number >= 0, got {self.seed}")
         if self.allocation not in ALLOCATIONS:
             raise unknown_name("allocation", self.allocation, ALLOCATIONS)
+        if self.obstacles not in SOURCES:
+            raise unknown_name("obstacles", self.obstacles, SOURCES)
         check_positive("duration", self.duration, "s")
         for name in ("margin", "slip_tolerance"):
             value = getattr(self, name)

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.planner import SegmentPlanner, path_deviation
+from sart_toolkit.augment.planner import SegmentPlanner, path_deviation, world_of
 from sart_toolkit.augment.strategies import strategy_name
 from sart_toolkit.backends.interface import Backend, Observation
-from sart_toolkit.collision.certificate import Certificate, certify
+from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     CONTROL_HZ,
@@ -109,16 +109,13 @@ class SegmentExecutor(abc.ABC):
         """What plans the segments of a source.
 
         Raises:
-            Mismatch: the demonstration doesn't tell where the scene's bodies were.
+            Mismatch: the demonstration is of another robot, or doesn't tell where the scene's
+                bodies were.
         """
         if source not in self._planners:
-            self._planners[source] = SegmentPlanner(
-                self._backend.robot,
-                self._backend.scene,
-                *self._sources[source],
-                self._config,
-                source,
-            )
+            demonstration, annotation = self._sources[source]
+            world = world_of(demonstration, self._backend.robot, self._backend.scene, self._config)
+            self._planners[source] = SegmentPlanner(world, annotation, self._config, source)
         return self._planners[source]
 
 
@@ -194,9 +191,9 @@ class RestoreExecutor(SegmentExecutor):
         """The record of a motion's execution, and the joints `(m, n)` as measured on the way."""
         backend, steps = self._backend, demonstration.steps
         gripper = float(steps.commanded_gripper[t_star])
-        scene = planner.scene
-        carried = scene.phases[t_star].carried
-        controller = ToolController(scene.collision.kinematics)
+        world = planner.world
+        grasped = world.phases[t_star].grasped
+        controller = ToolController(world.kinematics)
         backend.restore(demonstration.states[t_star])
         controller.reset(
             steps.commanded_joint_positions[t_star], steps.commanded_Ts_world_tool[t_star]
@@ -212,13 +209,13 @@ class RestoreExecutor(SegmentExecutor):
             backend.command(q, gripper)
             backend.step()
             if backend.capabilities.has_contacts:
-                check_untouched(backend, carried)
+                check_untouched(backend, grasped)
             if i % CONTROL_PER_RECORD:
                 seen = backend.observe()
             else:
                 seen = recorded = recorder.add(controller, gripper, 0.0)
             measured.append(seen.joint_path if len(seen.joint_path) else seen.q[None])
-        check_undisturbed(backend.scene, carried, start, recorded, self._config.slip_tolerance)
+        check_undisturbed(backend.scene, grasped, start, recorded, self._config.slip_tolerance)
         return recorder, np.concatenate(measured)
 
     def _proof(
@@ -234,9 +231,8 @@ class RestoreExecutor(SegmentExecutor):
         Raises:
             MotionRejected: the measured path can't be proved clear.
         """
-        placed = planner.scene.placed(t_star)
-        deviation = path_deviation(placed, motion, joint_path)
-        measured = certify(placed, PolylinePath(joint_path))
+        deviation = path_deviation(planner.world.placed(t_star), motion, joint_path)
+        measured = planner.world.certify(t_star, PolylinePath(joint_path))
         if measured.verdict != "free":
             raise MotionRejected(
                 f"left its path {' / '.join(measured.pair)}: by {deviation * 1e3:.1f} mm, "

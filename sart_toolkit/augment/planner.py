@@ -6,9 +6,9 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.strategies import Proposal, get_strategy
-from sart_toolkit.collision.certificate import Certificate, certify
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.collision.world import CollisionWorld, make_world
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import MotionRejected, Unreachable
 from sart_toolkit.motion.line import straight_line
@@ -27,19 +27,13 @@ class SegmentPlanner:
 
     def __init__(
         self,
-        robot: RobotSpec,
-        scene: SceneSpec,
-        demonstration: Demonstration,
+        world: CollisionWorld,
         annotation: Annotation,
         config: AugmentConfig,
         source: int = 0,
     ) -> None:
-        """Plan for a robot in the scene of the demonstration, the dataset's `source`-th.
-
-        Raises:
-            Mismatch: the demonstration doesn't tell where the scene's bodies were.
-        """
-        self.scene = DemonstratedScene(demonstration, robot, scene, config.slip_tolerance)
+        """Plan for a robot among the obstacles of a demonstration, the dataset's `source`-th."""
+        self.world = world
         self._annotation, self._config, self._source = annotation, config, source
 
     def proposal(self, sphere: int, k: int) -> tuple[Proposal, np.random.Generator]:
@@ -49,7 +43,7 @@ class SegmentPlanner:
         """
         rng = np.random.default_rng([self._config.seed, sphere, k, self._source])
         strategy = get_strategy(self._config.strategy)
-        demonstration = self.scene.demonstration
+        demonstration = self.world.demonstration
         at = self._annotation.spheres[sphere]
         return strategy.propose(demonstration, at, rng, self._config.sampling), rng
 
@@ -64,21 +58,33 @@ class SegmentPlanner:
             MotionRejected: the motion can't be proved clear, or a joint forbids it.
         """
         config, t = self._config, proposal.t_star
-        steps = self.scene.demonstration.steps
-        placed = self.scene.placed(t)
+        steps = self.world.demonstration.steps
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
         T_goal = proposal.T_world_sampled
+        self.world.check_known(t)
         try:
-            motion = straight_line(placed.kinematics, q, T, T_goal, config.duration)
-            certificate = certify(placed, motion.path, config.margin)
+            motion = straight_line(self.world.kinematics, q, T, T_goal, config.duration)
+            certificate = self.world.certify(t, motion.path, config.margin)
             certificate.check_free()
         except (Unreachable, MotionRejected):
             if not get_strategy(config.strategy).plans:
                 raise
             motion, certificate = plan_motion(
-                placed, q, T_goal, config.duration, config.margin, rng
+                self.world.placed(t), q, T_goal, config.duration, config.margin, rng
             )
         return motion, certificate
+
+
+def world_of(
+    demonstration: Demonstration, robot: RobotSpec, scene: SceneSpec, config: AugmentConfig
+) -> CollisionWorld:
+    """The obstacles that a configuration asks to prove segments clear of.
+
+    Raises:
+        Mismatch: the demonstration is of another robot, or doesn't tell where the scene's bodies
+            were.
+    """
+    return make_world(config.obstacles, demonstration, robot, scene, config.slip_tolerance)
 
 
 def path_deviation(placed: PlacedModel, motion: Motion, joint_path: Array) -> float:

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.planner import SegmentPlanner, path_deviation
+from sart_toolkit.augment.planner import SegmentPlanner, path_deviation, world_of
 from sart_toolkit.augment.strategies import strategy_name
-from sart_toolkit.collision.certificate import Certificate, certify
-from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.data.dataset import SUMMARY, Dataset, load_dataset
 from sart_toolkit.data.manifest import EpisodeEntry
 from sart_toolkit.data.records import (
@@ -26,6 +25,7 @@ from sart_toolkit.errors import BrokenFile, MotionRejected, SartError
 from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array
+from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec
 
@@ -106,7 +106,9 @@ class _EpisodeCheck:
         self._sources = dataset.sources
         self._config = config
         self._planners = [
-            SegmentPlanner(robot, scene, source.demonstration, source.annotation, config, i)
+            SegmentPlanner(
+                world_of(source.demonstration, robot, scene, config), source.annotation, config, i
+            )
             for i, source in enumerate(dataset.sources)
         ]
         self.least_clearance = np.inf
@@ -131,9 +133,8 @@ class _EpisodeCheck:
         if not p.certificate:
             raise MotionRejected("certificate: there is none")
         motion, commanded = planner.plan(proposal, rng)
-        placed = planner.scene.placed(p.t_star)
-        measured = certify(placed, PolylinePath(episode.joint_path))
-        deviation = path_deviation(placed, motion, episode.joint_path)
+        measured = planner.world.certify(p.t_star, PolylinePath(episode.joint_path))
+        deviation = path_deviation(planner.world.placed(p.t_star), motion, episode.joint_path)
         self._compare(p.certificate, "commanded", commanded)
         self._compare(p.certificate, "measured", measured)
         if abs(p.certificate["deviation"] - deviation) > _LENGTH_TOLERANCE:
@@ -142,7 +143,7 @@ class _EpisodeCheck:
                 f"{p.certificate['deviation'] * 1e3:.3f} mm are stated"
             )
         self.largest_deviation = max(self.largest_deviation, deviation)
-        _check_reversal(episode, motion, placed)
+        _check_reversal(episode, motion, planner.world.kinematics)
         _check_actions(episode, self._sources[p.source].demonstration)
 
     def _compare(self, stated: Mapping[str, Any], which: str, found: Certificate) -> None:
@@ -160,7 +161,7 @@ class _EpisodeCheck:
         self.least_clearance = min(self.least_clearance, found.clearance)
 
 
-def _check_reversal(episode: Episode, motion: Motion, placed: PlacedModel) -> None:
+def _check_reversal(episode: Episode, motion: Motion, model: RobotModel) -> None:
     """Return if an episode commands a motion backwards, and measured its joint path backwards."""
     steps = episode.steps
     times = motion.times(RECORD_HZ)
@@ -175,7 +176,7 @@ def _check_reversal(episode: Episode, motion: Motion, placed: PlacedModel) -> No
         raise MotionRejected("reversal: the commanded poses aren't the planned line backwards")
     if not _in_order(steps.joint_positions[::-1], episode.joint_path):
         raise MotionRejected("reversal: the measured joints aren't the measured path backwards")
-    measured = np.array([placed.kinematics.fk(q) for q in steps.joint_positions])
+    measured = np.array([model.fk(q) for q in steps.joint_positions])
     if np.abs(measured - steps.measured_Ts_world_tool).max() > 100 * _POSE_TOLERANCE:
         raise MotionRejected("reversal: measured tool poses and joints don't belong together")
 

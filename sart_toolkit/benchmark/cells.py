@@ -17,6 +17,7 @@ from sart_toolkit.tasks.task import Placement, Task
 
 # Where only the outcome is asked for, neither pictures nor states are kept.
 BLIND = SessionConfig(cameras=(), keep_states=False)
+WITHOUT_PICTURES = SessionConfig(cameras=())
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,10 @@ def demonstrate(
     return record_demonstration(backend, task, model, operator, placement, config=config)
 
 
-def recorded(cell: Cell, backend: Backend, seed: int) -> Demonstration:
-    """The scripted operator's demonstration of a cell's task, without pictures.
+def recorded(
+    cell: Cell, backend: Backend, seed: int, config: SessionConfig = WITHOUT_PICTURES
+) -> Demonstration:
+    """The scripted operator's demonstration of a cell's task, without pictures if not asked for.
 
     Raises:
         Mismatch: it did not reach the goal.
@@ -55,7 +58,7 @@ def recorded(cell: Cell, backend: Backend, seed: int) -> Demonstration:
     rng = np.random.default_rng([seed, 0])
     placement = cell.task.sample_placement(rng)
     model = RobotModel(backend.robot, backend.scene.held)
-    shown = demonstrate(cell.task, backend, model, placement, rng, SessionConfig(cameras=()))
+    shown = demonstrate(cell.task, backend, model, placement, rng, config)
     if not cell.task.achieved(shown.success):
         raise Mismatch(f"{cell.name}: the demonstration did not reach the goal; try another --seed")
     return shown

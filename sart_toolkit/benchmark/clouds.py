@@ -10,19 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.annotate.cloud import CloudSurroundings
-from sart_toolkit.annotate.suggest import (
-    ExactSurroundings,
-    SuggestConfig,
-    suggest_annotation,
-    suggest_radius,
-)
+from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation, suggest_radius
 from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.collision.cloud import fuse_cloud, surface_errors
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.cloud_world import CloudWorld
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.model import ConvexPart
-from sart_toolkit.data.records import Demonstration, library_versions
+from sart_toolkit.data.records import library_versions
 from sart_toolkit.poses import Array
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
@@ -65,15 +60,13 @@ def benchmark_clouds(
     }
 
 
-def _on_robot(
-    points: Array, scene: ExactSurroundings, shown: Demonstration, waypoints: Sequence[int]
-) -> int:
+def _on_robot(points: Array, world: ExactWorld, waypoints: Sequence[int]) -> int:
     """How many points `(n, 3)` the robot or what it holds covers at one of the waypoints."""
     covered = np.zeros(len(points), dtype=bool)
     hulls: dict[ConvexPart, Hull] = {}
     for t in waypoints:
-        placed = scene.placed(t)
-        Ts = placed.joint_poses(shown.steps.joint_positions[t])
+        placed = world.placed(t)
+        Ts = placed.joint_poses(world.demonstration.steps.joint_positions[t])
         for part in placed.parts:
             if part.joint > 0:
                 if part not in hulls:
@@ -91,11 +84,11 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
         plan = task.plan(task.initial_state(model, Placement()))
         operator = ScriptedOperator(plan, np.random.default_rng(seed))
         shown = record_demonstration(backend, task, model, operator, seed=seed)
-    exact = ExactSurroundings(DemonstratedScene(shown, robot, task.scene))
+    exact = ExactWorld(shown, robot, task.scene)
     started = time.perf_counter()
     annotation = suggest_annotation(shown, exact)
     seconds_exact = time.perf_counter() - started
-    cloud = CloudSurroundings(shown, robot, task.scene)
+    cloud = CloudWorld(shown, robot, task.scene)
     started = time.perf_counter()
     tiled = suggest_annotation(shown, cloud)
     seconds_cloud = time.perf_counter() - started
@@ -103,8 +96,8 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
     spheres: list[dict[str, Any]] = []
     for sphere in annotation.spheres:
         of = {
-            name: suggest_radius(surroundings, shown, sphere.waypoint, config)
-            for name, surroundings in (("exact", exact), ("cloud", cloud))
+            name: suggest_radius(world, shown, sphere.waypoint, config)
+            for name, world in (("exact", exact), ("cloud", cloud))
         }
         spheres.append(
             {"waypoint": sphere.waypoint}
@@ -112,7 +105,7 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
             | {f"{name}_limited_by": found.limited_by for name, found in of.items()}
         )
     still = next(
-        (t for t, phase in enumerate(exact.phases) if phase.contacts or phase.carried), len(shown)
+        (t for t, phase in enumerate(exact.phases) if phase.contacts or phase.grasped), len(shown)
     )
     errors = None
     if still > 1:
@@ -130,7 +123,7 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
             "median_mm": float(np.median(distances)),
             "p95_mm": float(np.percentile(distances, 95)),
             "max_mm": float(distances.max()),
-            "on_robot": _on_robot(seen.points, exact, shown, range(still)),
+            "on_robot": _on_robot(seen.points, exact, range(still)),
         }
     return {
         "waypoints": len(shown),

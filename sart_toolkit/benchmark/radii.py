@@ -13,10 +13,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sart_toolkit.annotate.suggest import ExactSurroundings, SuggestConfig, suggest_annotation
+from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
 from sart_toolkit.benchmark.cells import Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import PlacedModel, coal_transform, convex_distance
 from sart_toolkit.data.records import (
     PrecisionSphere,
@@ -100,19 +100,19 @@ class RadiiConfig:
 class SphereTrial:
     """Tries spheres of a demonstration: random poses within, directed ones in a larger one."""
 
-    def __init__(self, scene: DemonstratedScene, checker: Checker, config: RadiiConfig) -> None:
-        """Try spheres in a scene; `checker` is asked as well as the scene's own model."""
-        self._scene, self._checker, self._config = scene, checker, config
+    def __init__(self, world: ExactWorld, checker: Checker, config: RadiiConfig) -> None:
+        """Try spheres in a world; `checker` is asked as well as the world's own model."""
+        self._world, self._checker, self._config = world, checker, config
 
     def __call__(self, sphere: PrecisionSphere, rng: np.random.Generator) -> dict[str, Any]:
         """What became of a sphere's draws, as JSON values; distances in millimetres.
 
         `collisions` counts poses at which one of the two models of the whole robot overlaps, with
         what is carried where it was in the grasp. `within_margin` tells whether a directed draw
-        came nearer than the margin, and the play in the grasp, that a suggested radius leaves.
+        came nearer than the margin, and the slip tolerance, that a suggested radius leaves.
         """
         t = sphere.waypoint
-        self._checker.place(*self._scene.at(t))
+        self._checker.place(*self._world.at(t))
         return {
             "waypoint": t,
             "radius": sphere.radius,
@@ -124,16 +124,16 @@ class SphereTrial:
 
     def _joints(self, t: int, T_world_tool: Array) -> Array | None:
         """Joints `(n,)` near waypoint `t`'s for a tool pose; None where there are none."""
-        near = self._scene.demonstration.steps.joint_positions[t]
+        near = self._world.demonstration.steps.joint_positions[t]
         try:
-            return self._scene.collision.kinematics.ik(T_world_tool, near, _LARGEST_STEP)
+            return self._world.collision.kinematics.ik(T_world_tool, near, _LARGEST_STEP)
         except (Unreachable, MotionRejected):
             return None
 
     def _random(self, sphere: PrecisionSphere, rng: np.random.Generator) -> dict[str, Any]:
         """Poses in the ball, half of them on its surface, turned as augmentation turns them."""
         t = sphere.waypoint
-        placed = self._scene.placed(t)
+        placed = self._world.placed(t)
         most = self._config.suggest.rotation_per_metre * sphere.radius
         unreachable, collisions = 0, []
         least, least_checked, pair = np.inf, np.inf, ("", "")
@@ -146,7 +146,7 @@ class SphereTrial:
             if q is None:
                 unreachable += 1
                 continue
-            distances = placed.distances(q) + placed.play
+            distances = placed.distances(q) + placed.slip
             nearest = int(np.argmin(distances))
             seen = self._checker.nearest(q)
             if distances[nearest] < least:
@@ -179,13 +179,13 @@ class SphereTrial:
         models, has to agree.
         """
         t = sphere.waypoint
-        placed = self._scene.placed(t)
+        placed = self._world.placed(t)
         limiting = tuple((sphere.limited_by or "").split(" / "))
         if limiting not in {placed.names(pair) for pair in placed.tool_pairs()}:
             return None
         radius = self._config.growth * sphere.radius
         angle = self._config.suggest.rotation_per_metre * radius
-        q_key = self._scene.demonstration.steps.joint_positions[t]
+        q_key = self._world.demonstration.steps.joint_positions[t]
         search = _Search(placed, q_key, limiting, radius, angle, rng)
         tried, found = 0.0, False
         while search.draws < self._config.directed and not found:
@@ -195,7 +195,7 @@ class SphereTrial:
                 q = self._joints(t, T)
                 found = (
                     q is not None
-                    and bool((placed.distances(q) + placed.play).min() < 0)
+                    and bool((placed.distances(q) + placed.slip).min() < 0)
                     and self._checker.nearest(q).distance < 0
                 )
         return {
@@ -203,7 +203,7 @@ class SphereTrial:
             "draws": search.draws,
             "collided": found,
             "least_mm": search.least * 1e3,
-            "within_margin": bool(search.least_with_play < self._config.suggest.margin),
+            "within_margin": bool(search.least_with_slip < self._config.suggest.margin),
         }
 
 
@@ -241,7 +241,7 @@ class _Search:
                     T_tool_joint @ part.T_joint_part,
                     obstacle.geometry,
                     coal_transform(obstacle.T_joint_part),
-                    float(placed.play[k]),
+                    float(placed.slip[k]),
                 )
             )
             witness = placed.witness(q_key, k)
@@ -255,7 +255,7 @@ class _Search:
                 self._aims.append((gap / length, points, weights / weights.sum()))
         self.draws = 0
         self._best = np.zeros(3), np.zeros(3)
-        self.least = self.least_with_play = float("inf")
+        self.least = self.least_with_slip = float("inf")
 
     def draw(self) -> tuple[float, Array]:
         """The next draw: how far [m] the tool is from the scene there, and its pose `(4, 4)`."""
@@ -266,12 +266,12 @@ class _Search:
         T[:3, :3] = exp_rotation(w) @ T[:3, :3]
         T[:3, 3] += p
         distances = [
-            (convex_distance(a, coal_transform(T @ T_tool_part), b, T_b), play)
-            for a, T_tool_part, b, T_b, play in self._pairs
+            (convex_distance(a, coal_transform(T @ T_tool_part), b, T_b), slip)
+            for a, T_tool_part, b, T_b, slip in self._pairs
         ]
         least = min(distance for distance, _ in distances)
-        self.least_with_play = min(
-            self.least_with_play, *(distance - play for distance, play in distances)
+        self.least_with_slip = min(
+            self.least_with_slip, *(distance - slip for distance, slip in distances)
         )
         if least < self.least:
             self.least, self._best = least, (p, w)
@@ -323,19 +323,18 @@ class _Radii:
             shown = recorded(cell, backend, config.seed)
             robot, bodies = backend.robot, backend.scene
         started = time.perf_counter()
-        scene = DemonstratedScene(shown, robot, bodies)
-        surroundings = ExactSurroundings(scene)
+        world = ExactWorld(shown, robot, bodies)
         for t in range(len(shown)):
-            scene.placed(t)
+            world.placed(t)
         built = time.perf_counter() - started
         seconds = []
         for _ in range(1 + _SUGGESTIONS):
             started = time.perf_counter()
-            annotation = suggest_annotation(shown, surroundings, config=config.suggest)
+            annotation = suggest_annotation(shown, world, config=config.suggest)
             seconds.append(time.perf_counter() - started)
         rows = []
         with closing(self._make_checker(robot, bodies)) as checker:
-            attempt = SphereTrial(scene, checker, config)
+            attempt = SphereTrial(world, checker, config)
             for i, sphere in enumerate(annotation.spheres):
                 rows.append(attempt(sphere, np.random.default_rng([config.seed, i])))
         return {

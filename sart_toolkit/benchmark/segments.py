@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import RestoreExecutor
-from sart_toolkit.augment.planner import SegmentPlanner
+from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.benchmark.cells import Cell, check_counts, recorded
+from sart_toolkit.benchmark.cells import WITHOUT_PICTURES, Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.world import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     CONTROL_HZ,
@@ -33,6 +33,7 @@ from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.motion.path import nearest_on_polyline
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array
+from sart_toolkit.record.session import SessionConfig
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.workers import worker_map
 
@@ -43,10 +44,11 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class SegmentsConfig:
-    """How many segments are tried in all, and from which seed."""
+    """How many segments are attempted in all, from which seed, proved clear of what obstacles."""
 
     count: int = 10_000
     seed: int = 0
+    obstacles: Source = "scene"
 
     def __post_init__(self) -> None:
         check_counts(self, "count")
@@ -105,7 +107,7 @@ class _Segments:
 
     def __init__(self, cells: Sequence[Cell], config: SegmentsConfig) -> None:
         self._cells = {cell.name: cell for cell in cells}
-        self._augment = AugmentConfig(seed=config.seed, camera=None)
+        self._augment = AugmentConfig(seed=config.seed, obstacles=config.obstacles, camera=None)
         self._open: tuple[str, Backend, Annotation, SegmentPlanner, RestoreExecutor] | None = None
 
     def _opened(self, name: str) -> tuple[Annotation, SegmentPlanner, RestoreExecutor]:
@@ -114,9 +116,11 @@ class _Segments:
             cell = self._cells[name]
             backend = cell.make_backend()
             try:
-                shown = recorded(cell, backend, self._augment.seed)
-                scene = DemonstratedScene(shown, backend.robot, backend.scene)
-                annotation = suggest_annotation(shown, ExactSurroundings(scene))
+                exact = self._augment.obstacles == "scene"
+                session = WITHOUT_PICTURES if exact else SessionConfig()
+                shown = recorded(cell, backend, self._augment.seed, session)
+                world = world_of(shown, backend.robot, backend.scene, self._augment)
+                annotation = suggest_annotation(shown, world)
                 executor = RestoreExecutor(backend, [(shown, annotation)], self._augment)
             except BaseException:
                 backend.close()
@@ -131,7 +135,7 @@ class _Segments:
         sphere = annotation.spheres[at]
         started = time.perf_counter()
         proposal, rng = planner.proposal(at, k)
-        model = planner.scene.collision.kinematics
+        model = planner.world.kinematics
         motion: Motion | None = None
         row: dict[str, Any] = {
             "cell": name,
@@ -149,7 +153,7 @@ class _Segments:
         except (Unreachable, MotionRejected):
             pass
         else:
-            commanded = planner.scene.demonstration.steps.commanded_joint_positions
+            commanded = planner.world.demonstration.steps.commanded_joint_positions
             found = check_motion(model, motion, commanded[proposal.t_star])
             row["planned"] = {
                 "clearance": certificate.clearance,
@@ -186,9 +190,9 @@ def benchmark_segments(
     """How augmentation's segments fare in simulation, and whether they keep what they promise.
 
     For each cell a demonstration of the scripted operator is recorded and spheres are suggested;
-    the tries are shared evenly among the cells, and go round-robin over a cell's spheres. No
-    pictures are taken. Finished tries are kept beside `out` until all are done: interrupted, it
-    goes on there.
+    the attempts are shared evenly among the cells, and go round-robin over a cell's spheres. No
+    pictures are taken but those that the obstacles are known from. Finished attempts are kept
+    beside `out` until all are done: interrupted, it resumes.
 
     Args:
         cells: tasks on backends.
@@ -201,7 +205,7 @@ def benchmark_segments(
 
     Raises:
         OutputExists: `out` is there and `overwrite` is false.
-        Mismatch: it was interrupted with another seed, or a demonstration failed.
+        Mismatch: it was interrupted with another seed or obstacles, or a demonstration failed.
         InvalidInput: there are fewer tries than cells.
         MissingCapability: a backend can't restore states.
         CannotWrite: the disk refuses.
@@ -210,7 +214,8 @@ def benchmark_segments(
         raise InvalidInput(f"count: expected at least {len(cells)}, got {config.count}")
     share, rest = divmod(config.count, len(cells))
     wanted = [(cell.name, i) for n, cell in enumerate(cells) for i in range(share + (n < rest))]
-    log = ResultLog(out, {"benchmark": "segments", "seed": config.seed}, overwrite)
+    asked = {"benchmark": "segments", "seed": config.seed, "obstacles": config.obstacles}
+    log = ResultLog(out, asked, overwrite)
     rows = {(row["cell"], row["try"]): row for row in log.rows}
     missing = [item for item in wanted if item not in rows]
     done = len(wanted) - len(missing)

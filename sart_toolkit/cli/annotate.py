@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from sart_toolkit import doctor
-from sart_toolkit.annotate.cloud import CloudSurroundings
 from sart_toolkit.annotate.session import ACTIONS, KEYS, AnnotateConfig, AnnotationSession
-from sart_toolkit.annotate.suggest import ExactSurroundings, SuggestConfig, Surroundings
+from sart_toolkit.annotate.suggest import SuggestConfig
 from sart_toolkit.cli.arguments import Annotate, Suggest
 from sart_toolkit.cli.console import say
 from sart_toolkit.collision.cloud import CloudConfig
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.world import CollisionWorld, make_world
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.storage import (
     Journal,
@@ -45,13 +44,11 @@ def suggest_config(args: Suggest | Annotate) -> SuggestConfig:
     return SuggestConfig(margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius)
 
 
-def surroundings_of(args: Suggest | Annotate, demonstration: Demonstration) -> Surroundings:
+def world_of(args: Suggest | Annotate, demonstration: Demonstration) -> CollisionWorld:
     """Where the obstacles are, from the source that was asked for."""
     robot, scene = get_robot(demonstration.robot), get_task(demonstration.task).scene
-    if args.source == "cloud":
-        cloud = CloudConfig(unknown=args.unknown)
-        return CloudSurroundings(demonstration, robot, scene, cloud, args.grasp_play)
-    return ExactSurroundings(DemonstratedScene(demonstration, robot, scene, args.grasp_play))
+    cloud = CloudConfig(unknown=args.unknown)
+    return make_world(args.source, demonstration, robot, scene, args.slip_tolerance, cloud)
 
 
 def describe_spheres(annotation: Annotation) -> list[Result]:
@@ -85,13 +82,13 @@ def annotate_verb(args: Annotate) -> Result:
         annotation = (
             None if args.overwrite or not out.exists() else _annotation_at(out, demonstration)
         )
-        surroundings = surroundings_of(args, demonstration)
+        world = world_of(args, demonstration)
         if probe is not None and not (finding := probe.result()).ok:
             raise MissingCapability(f"no window: {finding.detail}; {finding.remedy}; {_WITHOUT}")
     journal = Journal(journal_path)
     if args.overwrite:
         journal.clear()
-    session = AnnotationSession(demonstration, surroundings, config, annotation, out, journal)
+    session = AnnotationSession(demonstration, world, config, annotation, out, journal)
     with closing(session):
         session.shown = args.show
         if session.message:

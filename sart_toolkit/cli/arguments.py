@@ -30,8 +30,8 @@ _YAW = Annotated[
 _LOOKS = Annotated[bool, arg(help="Vary colours, light and the wrist camera's mounting at random.")]
 _TASKS = Annotated[str, arg(help="Names of tasks with commas between, or all.")]
 _BACKENDS = Annotated[str, arg(help="Names of backends with commas between, or all.")]
-_GRASP_PLAY = Annotated[
-    float, arg(help="How far what is carried may move in the grasp [m]; so much more is kept free.")
+_SLIP_TOLERANCE = Annotated[
+    float, arg(help="How far what is grasped may move in the grasp [m]; so much more is kept free.")
 ]
 _SOURCE = Annotated[
     Literal["scene", "cloud"],
@@ -169,7 +169,7 @@ class Suggest:
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
     margin: _TOOL_MARGIN = 0.0005
-    grasp_play: _GRASP_PLAY = 0.005
+    slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
     max_radius: _MAX_RADIUS = 0.15
     overwrite: _OVERWRITE = False
@@ -205,7 +205,7 @@ class Annotate:
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
     margin: _TOOL_MARGIN = 0.0005
-    grasp_play: _GRASP_PLAY = 0.005
+    slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
     max_radius: _MAX_RADIUS = 0.15
     overwrite: Annotated[bool, arg(help="Begin anew instead of going on.")] = False
@@ -221,6 +221,8 @@ class Augment:
     Example: sart augment demo.h5 annotation.json --out dataset --n 100 --workers 2
 
     Example: sart augment demo.h5 annotation.json --out dataset --strategy sart_planned
+
+    Example: sart augment demo.h5 annotation.json --out dataset --source cloud
 
     An interrupted generation resumes when the same command is typed again.
     """
@@ -247,10 +249,11 @@ class Augment:
     duration: Annotated[
         float, arg(help="Seconds each segment takes, delta; more where the joints need it.")
     ] = 2.0
+    source: _SOURCE = "scene"
     margin: Annotated[
         float, arg(help="Distance that every segment is proved to keep free [m].")
     ] = 0.0002
-    slip_tolerance: _GRASP_PLAY = 0.005
+    slip_tolerance: _SLIP_TOLERANCE = 0.005
     seed: _SEED = 0
     workers: _WORKERS = 1
     overwrite: _OVERWRITE = False
@@ -378,10 +381,14 @@ class BenchmarkSegments:
     """How augmentation's segments fare: kept, touched, off their path, beyond the joints' limits.
 
     On each task and backend a demonstration is recorded, spheres are suggested, and segments are
-    tried from them in turn, without pictures.
+    attempted from them in turn, without pictures. With --source cloud spheres and segments are
+    proved against what the demonstration's camera saw, and executed in the true scene.
 
     Example: sart benchmark segments --tasks all --backends pybullet --count 10000
         --out segments.json
+
+    Example: sart benchmark segments --tasks peg_in_hole --backends pybullet --source cloud
+        --count 200
 
     Interrupted, it goes on where it was when the same command is typed again.
     """
@@ -389,6 +396,7 @@ class BenchmarkSegments:
     tasks: _TASKS = "all"
     backends: _BACKENDS = "all"
     count: Annotated[int, arg(help="Segments to try, shared by tasks and backends.")] = 10_000
+    source: _SOURCE = "scene"
     seed: _SEED = 0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_segments.json")
     workers: _WORKERS = 2

@@ -32,7 +32,7 @@ from sart_toolkit.cli.annotate import (
     annotate_verb,
     describe_spheres,
     suggest_config,
-    surroundings_of,
+    world_of,
 )
 from sart_toolkit.cli.arguments import (
     Annotate,
@@ -176,11 +176,11 @@ def suggest_verb(args: Suggest) -> Result:
     demonstration = load_demonstration(args.demo)
     config = suggest_config(args)
     check_writable(args.out, args.overwrite)
-    surroundings = surroundings_of(args, demonstration)
+    world = world_of(args, demonstration)
     with progress_bar("suggest", len(demonstration), "waypoint") as bar:
         annotation = suggest_annotation(
             demonstration,
-            surroundings,
+            world,
             args.waypoints or None,
             config,
             progress=lambda t: bar.update(t + 1 - bar.n),
@@ -202,6 +202,7 @@ def augment_verb(args: Augment) -> Result:
         duration=args.duration,
         margin=args.margin,
         slip_tolerance=args.slip_tolerance,
+        obstacles=args.source,
         seed=args.seed,
     )
     task = get_task(demonstration.task)
@@ -459,7 +460,7 @@ def benchmark_replay_verb(args: BenchmarkReplay) -> Result:
 def benchmark_segments_verb(args: BenchmarkSegments) -> Result:
     """`sart benchmark segments`."""
     cells = _cells(args.tasks, args.backends)
-    config = SegmentsConfig(args.count, args.seed)
+    config = SegmentsConfig(args.count, args.seed, args.source)
     with progress_bar("segments", args.count, "segment") as bar:
 
         def progress(done: int, wanted: int, kept: int) -> None:

@@ -8,7 +8,14 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from sart_toolkit.collision.model import Index, PlacedModel, cross, gap_text, norms
+from sart_toolkit.collision.model import (
+    Enclosures,
+    Index,
+    PlacedModel,
+    cross,
+    gap_text,
+    norms,
+)
 from sart_toolkit.errors import InvalidInput, MotionRejected
 from sart_toolkit.poses import Array, check_positive
 
@@ -25,7 +32,7 @@ class JointPath(Protocol):
     def positions(self, s: Array) -> Array:
         """The configurations `(k, n)` [rad] at parameters `(k,)`."""
 
-    def bulge(self, start: Array, end: Array) -> Array:
+    def chord_deviation(self, start: Array, end: Array) -> Array:
         """For intervals `(k,)`: `(k, n)` [rad], no less than how far each joint is ever from the
         chord, the straight joint motion between the interval's ends.
         """
@@ -102,11 +109,11 @@ def certify(
     - the greatest path length of a point along the chord, (v(a) + v(b)) / 2 + A / 4, v being its
       speed at the ends and A = sum_jk |dq_j| |dq_k| R_max(j,k) no less than its acceleration over
       the chord's unit parameter;
-    - twice what the path's bulge beyond its chord adds, sum_j R_j e_j;
+    - twice what the path's deviation from its chord adds, sum_j R_j e_j;
 
     with R_j the farthest that a point of the body can be from joint j in any configuration. First
-    d is bounded by spheres and boxes; coal computes it where that doesn't do, and only intervals
-    and pairs still open are bisected.
+    d is bounded by spheres, boxes and the cloud's nearest points; coal computes it where that
+    doesn't do, and only intervals and pairs still open are bisected.
 
     Args:
         placed: robot and scene.
@@ -128,8 +135,9 @@ class _Knots:
     """What is known at some path parameters `s (k,)`, where the joints are at `q (k, n)`.
 
     `turns`, `moments (k, n, 3)`: the joints' axes, and the velocity of the point at the origin that
-    turning about each gives; `centres`, `axes`, `middles`: spheres and boxes of the parts, as from
-    `Bounds.placed`; `distances (k, p)`: the pairs' by coal, NaN where not computed yet.
+    turning about each gives; `centres`, `axes`, `middles`, `beside`: spheres and boxes of the
+    parts, as from `Bounds.placed`; `distances (k, p)`: the pairs' by coal, NaN where not computed
+    yet.
     """
 
     s: Array
@@ -139,7 +147,12 @@ class _Knots:
     centres: Array
     axes: Array
     middles: Array
+    beside: Array
     distances: Array
+
+    @property
+    def enclosures(self) -> Enclosures:
+        return self.centres, self.axes, self.middles, self.beside
 
     @staticmethod
     def at(placed: PlacedModel, path: JointPath, s: Array) -> _Knots:
@@ -219,7 +232,7 @@ class _Search:
         return spin, drift
 
     def _motion(self, ends: Index, interval: Index, pair: Index) -> tuple[Array, Array]:
-        """For pairs on intervals: mu `(k,)` [m], and what spheres and boxes prove `(k,)` [m].
+        """For pairs on intervals: mu `(k,)` [m], and what rough distances prove `(k,)` [m].
 
         `ends (2, m)` are the intervals' knots; each pair has one of them by `interval (k,)`.
         """
@@ -235,18 +248,16 @@ class _Search:
             each.take(joint_a, 1) - each.take(joint_b, 1)
             for each in (spin.reshape(2, -1, 3), drift.reshape(2, -1, 3))
         )
-        of = ends.take(interval, 1) * at.centres.shape[1]
-        first, second = of + bounds.first.take(pair), of + bounds.second.take(pair)
+        knots = ends.take(interval, 1)
+        first = knots * at.centres.shape[1] + bounds.first.take(pair)
         centres = at.centres.reshape(-1, 3).take(first, 0)
         move = cross(turn, centres) + drifted
         mu = 0.5 * (norms(move) + norms(turn) * bounds.radii.take(pair)).sum(0)
-        bulge = self._path.bulge(at.s[ends[0]], at.s[ends[1]])
-        excess = _excess(chord, bulge)
+        deviation = self._path.chord_deviation(at.s[ends[0]], at.s[ends[1]])
+        excess = _excess(chord, deviation)
         chain = excess.reshape(-1, chord.shape[1]).take(interval * excess.shape[1] + base, 0)
         mu += np.einsum("ij,ij->i", bounds.reach.take(pair, 0), chain)
-        axes = at.axes.reshape(-1, 9).take(second, 0).reshape(*second.shape, 3, 3)
-        middles = at.middles.reshape(-1, 3).take(second, 0)
-        apart = bounds.rough_distances(centres, axes, middles, pair)
+        apart = bounds.rough_distances(at.enclosures, knots, pair)
         return mu, (apart.sum(0) - mu) / 2
 
     def _exact(self, knots: Index, pair: Index) -> Array:
@@ -295,8 +306,8 @@ class _Search:
         return Certificate(verdict, float(clearance), self._margin, names, float(at), self._checks)
 
 
-def _excess(chord: Array, bulge: Array) -> Array:
-    """What curvature adds to mu, as factors of R_j: `(k, n + 1, n)` for chords, bulges `(k, n)`.
+def _excess(chord: Array, deviation: Array) -> Array:
+    """What curvature adds to mu, as factors of R_j: `(k, n + 1, n)` for both `(k, n)`.
 
     mu grows by sum_j R_j (S_j^2 - S_(j-1)^2) / 4 + 2 R_j e_j, the first of which is A / 4, S_j
     being the sum of |dq_m| of the joints m of the chain up to j. Row b is for a chain from joint b.
@@ -305,4 +316,4 @@ def _excess(chord: Array, bulge: Array) -> Array:
     sums = np.zeros((k, n + 1))
     np.cumsum(np.abs(chord), 1, out=sums[:, 1:])
     squares = np.maximum(sums[:, None, :] - sums[:, :, None], 0.0) ** 2
-    return np.asarray(0.25 * np.diff(squares) + 2 * bulge[:, None])
+    return np.asarray(0.25 * np.diff(squares) + 2 * deviation[:, None])

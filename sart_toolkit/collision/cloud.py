@@ -40,7 +40,7 @@ _THROUGH_VOXELS, _THROUGH_SHARE = 2.0, 0.03
 _STEP, _TURN = 0.02, np.deg2rad(6.0)
 _MAX_PICTURES = 14
 # How far from the tool what it took away may reach, and how far it must have moved [m].
-_CARRIED_REACH, _CARRIED_AWAY = 0.15, 0.03
+_GRASPED_REACH, _GRASPED_AWAY = 0.15, 0.03
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,8 @@ class SceneCloud:
 
 
 @dataclass(frozen=True)
-class CarriedObject:
-    """What the gripper carried at some `waypoints`: points `(m, 3)` [m] of it in the tool frame.
+class GraspedObject:
+    """What was in the grasp at some `waypoints`: points `(m, 3)` [m] of it in the tool frame.
 
     Its convex hull counts as the object.
     """
@@ -148,23 +148,23 @@ class CarriedObject:
         object.__setattr__(self, "waypoints", tuple(self.waypoints))
         if not self.waypoints:
             raise InvalidInput(
-                "waypoints of a carried object: expected at least one, got none; name some"
+                "waypoints of a grasped object: expected at least one, got none; name some"
             )
 
 
 class _OwnBody:
-    """The robot's convex parts and what it carried, wherever its joints and its gripper are."""
+    """The robot's convex parts and what it has grasped, wherever its joints and its gripper are."""
 
     def __init__(
         self,
         demonstration: Demonstration,
         robot: RobotSpec,
         held: Sequence[Attachment],
-        carried: Sequence[CarriedObject],
+        grasped: Sequence[GraspedObject],
     ) -> None:
         self._steps = demonstration.steps
         self._robot, self._held = robot, tuple(held)
-        self._carried = [(each, Hull(each.points)) for each in carried]
+        self._grasped = [(each, Hull(each.points)) for each in grasped]
         self._models: dict[float, RobotModel] = {}
         model = self._model(0.0)
         Ts_link = model.link_poses(robot.home)
@@ -187,7 +187,7 @@ class _OwnBody:
         Ts_link = model.link_poses(self._steps.joint_positions[t])
         hulls = [(hull, Ts_link[link]) for link, hull in self._parts]
         T_tool = self._steps.measured_Ts_world_tool[t]
-        hulls += [(hull, T_tool) for each, hull in self._carried if t in each.waypoints]
+        hulls += [(hull, T_tool) for each, hull in self._grasped if t in each.waypoints]
         centres = np.stack([T[:3, :3] @ hull.centre + T[:3, 3] for hull, T in hulls])
         radii = np.array([hull.radius for hull, _ in hulls]) + margin
         # |p - c|^2 = |p|^2 - 2 p.c + |c|^2: one product for all.
@@ -286,21 +286,21 @@ def fuse_cloud(
     held: Sequence[Attachment],
     waypoints: Sequence[int] | None = None,
     config: CloudConfig | None = None,
-    carried: Sequence[CarriedObject] = (),
+    grasped: Sequence[GraspedObject] = (),
 ) -> SceneCloud:
     """The coloured point cloud of the scene that the wrist pictures at some waypoints show.
 
     Pictures are chosen by how far the camera has moved. The robot's own pixels and those of what
-    it carried are dropped, and points that a later picture looks through: what was there has
+    it grasped are dropped, and points that a later picture looks through: what was there has
     moved, or was noise.
 
     Args:
         demonstration: what was recorded, with depth.
         robot: the robot that recorded it.
         held: bodies fixed to it.
-        waypoints: whose pictures are used, all if left out. What isn't carried should stand still.
+        waypoints: whose pictures are used, all if left out. What isn't grasped should stand still.
         config: grid, ranges and rules.
-        carried: what the gripper carried; it is no part of the scene, neither in its grasp nor
+        grasped: what the gripper grasped; it is no part of the scene, neither in its grasp nor
             where it was taken from.
 
     Raises:
@@ -310,13 +310,13 @@ def fuse_cloud(
     """
     config = config or CloudConfig()
     views = _views(demonstration, robot, waypoints)
-    own = _OwnBody(demonstration, robot, held, carried)
+    own = _OwnBody(demonstration, robot, held, grasped)
     pixels = _scene_pixels(views, own, config)
     cells = _merged(pixels, views, config)
     reached = cKDTree(demonstration.steps.measured_Ts_world_tool[:, :3, 3])
     near = reached.query(cells.points, distance_upper_bound=config.reach)[0] <= config.reach
     keep = near & ~_moved_away(cells, views, config)
-    for each in carried:
+    for each in grasped:
         T = demonstration.steps.measured_Ts_world_tool[each.waypoints[0]]
         p_tool = (cells.points - T[:3, 3]) @ T[:3, :3]
         before = cells.last < each.waypoints[0]
@@ -523,15 +523,15 @@ class _MeanMisfit:
         return np.where(self._count > 0, self._sum / np.maximum(self._count, 1), np.inf)
 
 
-def carried_object(
+def grasped_object(
     demonstration: Demonstration,
     robot: RobotSpec,
     held: Sequence[Attachment],
     after: Sequence[int],
     before: Sequence[int] | None = None,
     config: CloudConfig | None = None,
-) -> CarriedObject | None:
-    """What the gripper carried away, as points in the tool frame; None if it carried nothing.
+) -> GraspedObject | None:
+    """What the gripper took away, as points in the tool frame; None if it took nothing.
 
     Of the points near the tool those belong to it that rode along with the tool in the pictures of
     `after`, and those seen in `before` that pictures of `after` look through. Without `before`
@@ -564,14 +564,14 @@ def carried_object(
             demonstration, robot, held, before, dataclasses.replace(config, unknown="free")
         )
         candidates = seen.points
-    near = np.linalg.norm(candidates - T_grasp[:3, 3], axis=1) <= _CARRIED_REACH
+    near = np.linalg.norm(candidates - T_grasp[:3, 3], axis=1) <= _GRASPED_REACH
     p_world = candidates[near]
     p_tool = (p_world - T_grasp[:3, 3]) @ T_grasp[:3, :3]
     rode, stayed = _MeanMisfit(len(p_world)), _MeanMisfit(len(p_world))
     gone = np.zeros(len(p_world), dtype=bool)
     for view in views:
         T = Ts[view.waypoint]
-        if np.linalg.norm(T[:3, 3] - T_grasp[:3, 3]) >= _CARRIED_AWAY:
+        if np.linalg.norm(T[:3, 3] - T_grasp[:3, 3]) >= _GRASPED_AWAY:
             rode.add(view.misfit(p_tool @ T[:3, :3].T + T[:3, 3], config.voxel))
             stayed.add(view.misfit(p_world, config.voxel))
             gone |= view.through(p_world, config.voxel)
@@ -587,7 +587,7 @@ def carried_object(
         across = (points - p_camera) * [1.0, 1.0, 0.0]
         across *= config.behind / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-6)
         points = np.concatenate([points, points + across])
-    return CarriedObject(points, held_at)
+    return GraspedObject(points, held_at)
 
 
 def surface_errors(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import coal
@@ -13,6 +12,7 @@ from scipy.spatial import cKDTree
 from sart_toolkit.collision.cloud import SceneCloud
 from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.model import ConvexPart, coal_transform
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, check_array
 
 # So many points at a time are held against all faces of a part.
@@ -23,26 +23,31 @@ _BLOCK = 256
 class CloudSeparation:
     """How far a part of the robot is from one point of a cloud.
 
-    `distance` [m] to the ball about `p_cloud (3,)`, negative where they overlap; `p_part (3,)` is
-    the part's point nearest to it, `normal (3,)` the unit vector from cloud to part; world frame.
+    `distance` [m] to the ball about the point, negative where they overlap; `p_part`, `p_ball (3,)`
+    are the nearest, or where they overlap the deepest, points of the two in the world.
     """
 
-    body: str
     distance: float
     p_part: Array
-    p_cloud: Array
-    normal: Array
+    p_ball: Array
 
 
 class CloudObstacles:
     """Distances from the robot's convex parts to the balls about a cloud's points."""
 
     def __init__(self, cloud: SceneCloud) -> None:
-        """Index the points of `cloud`; seen or filled in, all count."""
+        """Index the points of `cloud`; seen or filled in, all count.
+
+        Raises:
+            InvalidInput: the cloud has no points.
+        """
+        if not len(cloud):
+            raise InvalidInput("cloud: expected at least one point, got none; look at the pictures")
         self._points = cloud.points
         self._tree = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False)
         self._inflation = cloud.config.inflation
         self._ball = coal.Sphere(cloud.config.inflation)
+        self._request = coal.DistanceRequest()
         # Parts are the same only if they are one object: a gripper's move with its opening.
         self._hulls: dict[ConvexPart, Hull] = {}
 
@@ -51,27 +56,70 @@ class CloudObstacles:
             self._hulls[part] = Hull(part.points)
         return self._hulls[part]
 
+    def clearances(self, p_world: Array) -> Array:
+        """How far [m] points `(..., 3)` are from the balls, negative in one: `(...)`."""
+        return np.asarray(self._tree.query(p_world)[0] - self._inflation)
+
+    def distance(self, part: ConvexPart, T_world_joint: Array) -> float:
+        """A part's distance [m] from the ball that is nearest to it, negative where they overlap.
+
+        Args:
+            part: convex part of the robot.
+            T_world_joint: the pose `(4, 4)` of the joint that carries it.
+        """
+        return min(distance for distance, _ in self._near(part, T_world_joint, 0.0))
+
+    def separations(
+        self, part: ConvexPart, T_world_joint: Array, within: float
+    ) -> list[CloudSeparation]:
+        """The part's distance from each point, up to its smallest one plus `within`; nearest first.
+
+        Args:
+            part: convex part of the robot.
+            T_world_joint: the pose `(4, 4)` of the joint that carries it.
+            within: [m].
+        """
+        near = sorted(self._near(part, T_world_joint, within), key=lambda found: found[0])
+        return [
+            CloudSeparation(
+                distance, np.array(found.getNearestPoint2()), np.array(found.getNearestPoint1())
+            )
+            for distance, found in near
+            if distance <= near[0][0] + within
+        ]
+
+    def _near(
+        self, part: ConvexPart, T_world_joint: Array, within: float
+    ) -> list[tuple[float, coal.DistanceResult]]:
+        """Coal's results, all of points up to the smallest distance plus `within` among them."""
+        hull = self._hull(part)
+        placed = coal_transform(T_world_joint @ part.T_joint_part)
+        centre = T_world_joint[:3, :3] @ hull.centre + T_world_joint[:3, 3]
+        first = int(self._tree.query(centre)[1])
+        near = [self._separation(part, placed, first)]
+        smallest = near[0][0]
+        rows, p, coarse = self._candidates(hull, T_world_joint, smallest + within)
+        for start in range(0, len(rows), _BLOCK):
+            if coarse[start] > smallest + within:
+                break
+            bounds = hull.bound(p[start : start + _BLOCK]) - self._inflation
+            for at in np.argsort(bounds, kind="stable"):
+                if bounds[at] > smallest + within:
+                    break
+                row = int(rows[start + at])
+                if row != first:
+                    near.append(self._separation(part, placed, row))
+                    smallest = min(smallest, near[-1][0])
+        return near
+
     def _separation(
-        self, part: ConvexPart, placed: coal.Transform3s, index: int
-    ) -> CloudSeparation:
-        p_cloud = self._points[index]
+        self, part: ConvexPart, placed: coal.Transform3s, row: int
+    ) -> tuple[float, coal.DistanceResult]:
         # A result that is not new keeps the smallest distance it has seen.
         result = coal.DistanceResult()
-        distance = coal.distance(
-            self._ball,
-            coal.Transform3s(np.eye(3), p_cloud),
-            part.geometry,
-            placed,
-            coal.DistanceRequest(),
-            result,
-        )
-        return CloudSeparation(
-            part.body,
-            float(distance),
-            np.array(result.getNearestPoint2()),
-            p_cloud,
-            np.array(result.normal),
-        )
+        ball = coal.Transform3s(np.eye(3), self._points[row])
+        distance = coal.distance(self._ball, ball, part.geometry, placed, self._request, result)
+        return float(distance), result
 
     def _candidates(
         self, hull: Hull, T_world_joint: Array, within: float
@@ -89,64 +137,6 @@ class CloudObstacles:
         order = np.flatnonzero(bounds <= within)
         order = order[np.argsort(bounds[order], kind="stable")]
         return rows[order], p[order], bounds[order]
-
-    def distances(
-        self, part: ConvexPart, T_world_joint: Array, within: float
-    ) -> list[CloudSeparation]:
-        """The part's distance from each point, up to its smallest one plus `within`; nearest first.
-
-        Args:
-            part: convex part of the robot.
-            T_world_joint: the pose `(4, 4)` of the joint that carries it.
-            within: [m].
-        """
-        if not len(self._points):
-            return []
-        hull = self._hull(part)
-        placed = coal_transform(T_world_joint @ part.T_joint_part)
-        centre = T_world_joint[:3, :3] @ hull.centre + T_world_joint[:3, 3]
-        first = int(self._tree.query(centre)[1])
-        found = [self._separation(part, placed, first)]
-        smallest = found[0].distance
-        rows, p, coarse = self._candidates(hull, T_world_joint, smallest + within)
-        for start in range(0, len(rows), _BLOCK):
-            if coarse[start] > smallest + within:
-                break
-            bounds = hull.bound(p[start : start + _BLOCK]) - self._inflation
-            for at in np.argsort(bounds, kind="stable"):
-                if bounds[at] > smallest + within:
-                    break
-                row = int(rows[start + at])
-                if row == first:
-                    continue
-                found.append(self._separation(part, placed, row))
-                smallest = min(smallest, found[-1].distance)
-        found = [each for each in found if each.distance <= smallest + within]
-        return sorted(found, key=lambda each: each.distance)
-
-    def nearest(self, parts: Iterable[tuple[ConvexPart, Array]]) -> CloudSeparation | None:
-        """The smallest distance of some parts, each with its joint's pose; None without points."""
-        found = [each for part, T in parts for each in self.distances(part, T, 0.0)[:1]]
-        return min(found, key=lambda each: each.distance, default=None)
-
-    def any_within(self, parts: Iterable[tuple[ConvexPart, Array]], margin: float) -> str | None:
-        """The body of a part that is nearer than `margin` [m] to the cloud, or None.
-
-        Args:
-            parts: convex parts, each with the pose `(4, 4)` of the joint that carries it.
-            margin: [m].
-        """
-        for part, T in parts:
-            hull = self._hull(part)
-            rows, p, _ = self._candidates(hull, T, margin)
-            placed = coal_transform(T @ part.T_joint_part)
-            for start in range(0, len(rows), _BLOCK):
-                bounds = hull.bound(p[start : start + _BLOCK]) - self._inflation
-                for at in np.flatnonzero(bounds < margin):
-                    row = int(rows[start + at])
-                    if self._separation(part, placed, row).distance < margin:
-                        return part.body
-        return None
 
 
 def hull_part(name: str, joint: int, points: Array) -> ConvexPart:

@@ -29,8 +29,9 @@ class SplinePath:
         if (np.diff(spline.t[_DEGREE:-_DEGREE]) <= 0).any():
             raise InvalidInput("spline: has a knot twice, so that it isn't smooth; remove one")
         self.spline = spline
-        derivatives = _derivative_coefficients(spline.t, spline.c, 3)
-        self.most = frozen([np.abs(c).max(0) for c in derivatives])
+        self.most = frozen(
+            [np.abs(spline.derivative(order).c).max(0) for order in range(1, _DEGREE - 1)]
+        )
 
     @classmethod
     def through(cls, configurations: Array) -> SplinePath:
@@ -49,7 +50,7 @@ class SplinePath:
         """The configurations `(k, n)` [rad] at parameters `(k,)`."""
         return np.asarray(self.spline(np.asarray(s, dtype=np.float64)))
 
-    def bulge(self, start: Array, end: Array) -> Array:
+    def chord_deviation(self, start: Array, end: Array) -> Array:
         """Bounds `(k, n)` [rad] of the distance from each interval's chord: |q''| h² / 8."""
         h = np.asarray(end) - np.asarray(start)
         return h[:, None] ** 2 / 8 * self.most[1]
@@ -74,28 +75,28 @@ class PolylinePath:
         fraction = (at - i)[:, None]
         return (1 - fraction) * self.configurations[i] + fraction * self.configurations[i + 1]
 
-    def bulge(self, start: Array, end: Array) -> Array:
+    def chord_deviation(self, start: Array, end: Array) -> Array:
         """Bounds `(k, n)` [rad] of the distance from each interval's chord.
 
         Each configuration in an interval is compared with the nearest point of the chord.
         """
         last = len(self.configurations) - 1
         ends = self.positions(start), self.positions(end)
-        bulges = np.zeros((len(ends[0]), self.configurations.shape[1]))
+        deviations = np.zeros((len(ends[0]), self.configurations.shape[1]))
         for k, (a, b) in enumerate(np.stack([start, end], 1) * last):
             inside = self.configurations[int(np.ceil(a)) : int(np.floor(b)) + 1]
             if len(inside):
                 chord = ends[1][k] - ends[0][k]
                 along = (inside - ends[0][k]) @ chord / max(float(chord @ chord), 1e-300)
                 nearest = ends[0][k] + np.clip(along, 0.0, 1.0)[:, None] * chord
-                bulges[k] = np.abs(inside - nearest).max(0)
-        return bulges
+                deviations[k] = np.abs(inside - nearest).max(0)
+        return deviations
 
 
 def nearest_on_polyline(points: Array, line: Array) -> Array:
     """The points `(k, d)` of a line through many points `(m, d)` that are nearest to `(k, d)`.
 
-    Only the two pieces at the nearest of the line's points are looked at.
+    Only the two pieces at the nearest of the line's points, which SciPy finds, are looked at.
     """
     _, nearest = cKDTree(line).query(points)
     found, least = np.empty_like(points), np.full(len(points), np.inf)
@@ -114,18 +115,3 @@ def _interpolation(count: int) -> tuple[Array, Array]:
     """The knots of a quintic spline through `count` points, and the matrix to its coefficients."""
     spline = make_interp_spline(np.linspace(0.0, 1.0, count), np.eye(count), k=_DEGREE)
     return frozen(spline.t), frozen(spline.c)
-
-
-def _derivative_coefficients(knots: Array, coefficients: Array, order: int) -> list[Array]:
-    """B-spline coefficients of the first `order` derivatives.
-
-    c'_i = k (c_i+1 - c_i) / (t_i+k+1 - t_i+1) for degree k (de Boor, A Practical Guide to Splines).
-    """
-    found = []
-    t, c = knots, coefficients
-    for degree in range(_DEGREE, _DEGREE - order, -1):
-        width = t[degree + 1 : -1] - t[1 : -degree - 1]
-        c = degree * np.diff(c, axis=0) / width[:, None]
-        t = t[1:-1]
-        found.append(c)
-    return found

@@ -298,7 +298,7 @@ def _connected(
     tried = 0
 
     def clear(state: Any) -> bool:
-        return bool((placed.distances(np.array(state[0:n])) >= clearance).all())
+        return placed.too_close(np.array(state[0:n]), clearance) is None
 
     class Edges(base.MotionValidator):
         """Takes an edge if it is proved clear: faster than many checks along it, and safer."""

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.collision.demonstrated import demonstration_phases
+from sart_toolkit.collision.phases import demonstration_phases
 from sart_toolkit.data.records import RECORD_HZ, Demonstration, Episode, Image
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import Array, check_positive, inverse
@@ -158,7 +158,7 @@ class SceneView:
         Ts = {body.name: shown.body_Ts_world[body.name][t] for body in scene.bodies}
         q, T_world_tool = playback.joints(i)
         T_moved = T_world_tool @ inverse(shown.steps.measured_Ts_world_tool[t])
-        for name in self._phases[t].carried:
+        for name in self._phases[t].grasped:
             Ts[name] = T_moved @ Ts[name]
         joints = {name: scene.joint_position(name, Ts) for name in scene.jointed}
         for name, body in scene.jointed.items():

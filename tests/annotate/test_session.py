@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import os
@@ -21,7 +22,7 @@ from sart_toolkit.annotate.session import (
     AnnotateConfig,
     AnnotationSession,
 )
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation, suggest_radius
+from sart_toolkit.annotate.suggest import suggest_annotation, suggest_radius
 from sart_toolkit.data.records import PrecisionSphere, convergence_waypoint
 from sart_toolkit.data.sampling import sample_in_region, sample_pose
 from sart_toolkit.data.storage import (
@@ -35,9 +36,9 @@ from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, Mismatch,
 
 
 @pytest.fixture(scope="module")
-def prepared(peg_demonstration, peg_scene):
+def prepared(peg_demonstration, peg_world):
     """Everything computed ahead, to be shared by sessions: the scene is the same."""
-    session = AnnotationSession(peg_demonstration, ExactSurroundings(peg_scene))
+    session = AnnotationSession(peg_demonstration, peg_world)
     while session.prepare():
         pass
     _ = session.clearances
@@ -61,7 +62,7 @@ def open_session(prepared, tmp_path):
             old._journal and old._journal.close()
         session = AnnotationSession(
             prepared.demonstration,
-            prepared._surroundings,
+            prepared._world,
             annotation=annotation,
             out=tmp_path / "a.json",
             journal=Journal(tmp_path / "a.json.journal") if journal else None,
@@ -172,7 +173,7 @@ def test_the_radius_goes_up_and_down_in_coarse_and_fine_steps(session):
 def test_s_suggests_what_suggest_annotation_does(session, prepared):
     session.perform("go", 20)
     press(session, "S")
-    (wanted,) = suggest_annotation(prepared.demonstration, prepared._surroundings, [20]).spheres
+    (wanted,) = suggest_annotation(prepared.demonstration, prepared._world, [20]).spheres
     assert rows(session.spheres) == rows([wanted])
     assert session.sphere.source == "suggested" and session.sphere.clearance
     press(session, "End", "S")
@@ -311,7 +312,7 @@ def test_verdicts_agree_with_the_suggested_radius_at_every_waypoint(session, pre
     words = set()
     for t in range(session.last):
         found = suggest_radius(
-            prepared._surroundings,
+            prepared._world,
             prepared.demonstration,
             t,
             dataclasses.replace(session.config.suggest, min_radius=session.config.smallest),
@@ -333,18 +334,12 @@ def test_verdicts_agree_with_the_suggested_radius_at_every_waypoint(session, pre
 
 def test_during_a_contact_there_is_no_room(prepared):
     touching = dataclasses.replace(
-        prepared._surroundings.phases[0], contacts=frozenset({("peg", "block")})
+        prepared._world.phases[0], contacts=frozenset({("peg", "block")})
     )
 
-    class Touching(ExactSurroundings):
-        phases = (touching,) * len(prepared.demonstration)
-
-        def __init__(self):
-            self.__dict__.update(
-                {k: v for k, v in prepared._surroundings.__dict__.items() if k != "phases"}
-            )
-
-    session = AnnotationSession(prepared.demonstration, Touching())
+    world = copy.copy(prepared._world)
+    world.phases = (touching,) * len(prepared.demonstration)
+    session = AnnotationSession(prepared.demonstration, world)
     assert session.state()["verdict"] == "no room: contact peg / block"
     assert session.state()["phase"] == "touches peg / block"
     press(session, "Enter")
@@ -355,10 +350,10 @@ def test_during_a_contact_there_is_no_room(prepared):
     assert session.refused and "no waypoint has room" in session.message
 
 
-def test_the_path_s_clearance_is_that_of_the_nearest_pair(session, peg_scene):
+def test_the_path_s_clearance_is_that_of_the_nearest_pair(session, peg_world):
     for t in (0, 10, 25, session.last):
         q = session.demonstration.steps.joint_positions[t]
-        nearest = peg_scene.placed(t).tool_clearances(q)[0].distance
+        nearest = peg_world.placed(t).tool_clearances(q)[0].distance
         assert session.clearances[t] == pytest.approx(nearest, abs=1e-6)
 
 
@@ -370,7 +365,7 @@ def test_ghosts_are_poses_that_the_augmentation_draws(session):
         wanted = [draw(sphere, rng, session.config.sampling) for _ in range(3)]
         np.testing.assert_array_equal(session.ghosts(sphere), wanted)
     none = AnnotateConfig(ghosts=0)
-    assert AnnotationSession(session.demonstration, session._surroundings, none).ghosts(
+    assert AnnotationSession(session.demonstration, session._world, none).ghosts(
         session.sphere
     ).shape == (0, 4, 4)
 
@@ -542,17 +537,16 @@ KILLED = textwrap.dedent(
     import itertools, sys
     from pathlib import Path
     from sart_toolkit.robots import get_robot
-    from sart_toolkit.collision.demonstrated import DemonstratedScene
+    from sart_toolkit.collision.exact import ExactWorld
     from sart_toolkit.data.storage import Journal, load_demonstration
     from sart_toolkit.tasks import get_task
     from sart_toolkit.annotate.session import AnnotationSession
-    from sart_toolkit.annotate.suggest import ExactSurroundings
 
     demonstration = load_demonstration(Path(sys.argv[1]))
     robot, scene = get_robot(demonstration.robot), get_task(demonstration.task).scene
-    surroundings = ExactSurroundings(DemonstratedScene(demonstration, robot, scene))
+    world = ExactWorld(demonstration, robot, scene)
     session = AnnotationSession(
-        demonstration, surroundings, out=Path(sys.argv[2]), journal=Journal(Path(sys.argv[3]))
+        demonstration, world, out=Path(sys.argv[2]), journal=Journal(Path(sys.argv[3]))
     )
     for key in itertools.cycle(["Enter", "+", "Right", "Enter", "-", "Z", "Right", "P", "Up", "F"]):
         print("before", flush=True)

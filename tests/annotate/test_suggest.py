@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from sart_toolkit.annotate import suggest as suggest_module
 from sart_toolkit.annotate.suggest import (
-    ExactSurroundings,
     Gap,
     SuggestConfig,
     certified_radius,
@@ -17,7 +16,7 @@ from sart_toolkit.annotate.suggest import (
     suggest_radius,
 )
 from sart_toolkit.augment.strategies import sart
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.records import convergence_waypoint
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput
@@ -100,16 +99,16 @@ def test_by_a_plane_a_certified_radius_can_not_be_larger(points, distance, nu):
 
 
 def suggested(demonstration, scene, *args, **options):
-    return suggest_annotation(demonstration, ExactSurroundings(scene), *args, **options)
+    return suggest_annotation(demonstration, scene, *args, **options)
 
 
 class Elsewhere:
-    """The surroundings of a demonstration with the scene's bodies 5 m below."""
+    """The world of a demonstration with the scene's bodies 5 m below."""
 
     def __init__(self, demonstration, robot, scene):
         Ts = {k: T @ pose([0, 0, -5]) for k, T in demonstration.body_Ts_world.items()}
         shown = dataclasses.replace(demonstration, body_Ts_world=Ts)
-        self.surroundings = ExactSurroundings(DemonstratedScene(shown, robot, scene))
+        self.world = ExactWorld(shown, robot, scene)
 
 
 def test_suggested_spheres_start_at_waypoint_0_and_tile_the_free_part(
@@ -130,12 +129,12 @@ def test_suggested_spheres_start_at_waypoint_0_and_tile_the_free_part(
     assert peg_annotation.settings == dataclasses.asdict(config)
 
 
-def test_between_two_spheres_no_waypoint_has_room(peg_demonstration, peg_scene, peg_annotation):
+def test_between_two_spheres_no_waypoint_has_room(peg_demonstration, peg_world, peg_annotation):
     spheres = peg_annotation.spheres
     for sphere, following in zip(spheres, spheres[1:], strict=False):
         for t in range(convergence_waypoint(peg_demonstration, sphere), following.waypoint):
             with pytest.raises(InvalidInput, match="no room"):
-                suggested(peg_demonstration, peg_scene, [t])
+                suggested(peg_demonstration, peg_world, [t])
 
 
 def test_suggested_lengths_are_whole_micrometres(peg_annotation):
@@ -150,11 +149,11 @@ def test_the_first_sphere_covers_every_placement(peg_task, peg_annotation):
 
 
 def test_what_limits_a_radius_is_a_pair_at_the_stated_clearance(
-    peg_demonstration, peg_scene, peg_annotation
+    peg_demonstration, peg_world, peg_annotation
 ):
     for sphere in peg_annotation.spheres:
         q = peg_demonstration.steps.joint_positions[sphere.waypoint]
-        placed = peg_scene.placed(sphere.waypoint)
+        placed = peg_world.placed(sphere.waypoint)
         stated = {}
         for k in placed.tool_pairs():
             found = placed.witness(q, k)
@@ -164,13 +163,13 @@ def test_what_limits_a_radius_is_a_pair_at_the_stated_clearance(
 
 
 def test_every_pose_that_augmentation_draws_keeps_the_whole_robot_clear(
-    peg_demonstration, peg_scene, peg_annotation
+    peg_demonstration, peg_world, peg_annotation
 ):
     """Monte Carlo by the paper's law, on each sphere and inside it."""
     rng = np.random.default_rng(0)
     margin = SuggestConfig().margin
     for sphere in peg_annotation.spheres:
-        placed = peg_scene.placed(sphere.waypoint)
+        placed = peg_world.placed(sphere.waypoint)
         near = peg_demonstration.steps.joint_positions[sphere.waypoint]
         for i in range(60):
             radius = sphere.radius * (1.0 if i % 2 else rng.uniform())
@@ -182,15 +181,18 @@ def test_every_pose_that_augmentation_draws_keeps_the_whole_robot_clear(
 
 
 def test_a_little_larger_than_suggested_some_pose_would_touch(
-    peg_demonstration, peg_scene, peg_annotation
+    peg_demonstration, peg_world, peg_annotation
 ):
     """Draws about straight towards the obstacle, turned so that a near corner comes down."""
     rng = np.random.default_rng(0)
     for sphere in peg_annotation.spheres[:3]:
         assert sphere.limited_by == "peg / block"
-        placed = peg_scene.placed(sphere.waypoint)
+        placed = peg_world.placed(sphere.waypoint)
         near = peg_demonstration.steps.joint_positions[sphere.waypoint]
-        gap = next(ExactSurroundings(peg_scene).gaps(sphere.waypoint))
+        q_key = peg_demonstration.steps.joint_positions[sphere.waypoint]
+        pair = min(placed.tool_pairs(), key=lambda k: placed.pair_distances(q_key, [k])[0])
+        T_world_joint = placed.joint_poses(q_key)[-1]
+        gap = Gap.of(placed, pair, placed.witness(q_key, pair), T_world_joint)
         corners = gap.points[np.argsort(gap.points @ gap.normal)[:4]]
         grown, least = 1.15 * sphere.radius, np.inf
         for _ in range(400):
@@ -206,11 +208,11 @@ def test_a_little_larger_than_suggested_some_pose_would_touch(
 
 
 def test_a_rotation_free_augmentation_gets_larger_spheres_and_a_margin_smaller_ones(
-    peg_demonstration, peg_scene
+    peg_demonstration, peg_world
 ):
     def first(**changes):
         config = SuggestConfig(**changes)
-        return suggested(peg_demonstration, peg_scene, [19], config).spheres[0].radius
+        return suggested(peg_demonstration, peg_world, [19], config).spheres[0].radius
 
     assert first(rotation_per_metre=0.0) > first() > first(margin=0.005)
 
@@ -218,7 +220,7 @@ def test_a_rotation_free_augmentation_gets_larger_spheres_and_a_margin_smaller_o
 def test_where_nothing_is_near_the_arm_itself_limits_a_radius(
     peg_demonstration, peg_task, peg_model
 ):
-    far = Elsewhere(peg_demonstration, peg_model.spec, peg_task.scene).surroundings
+    far = Elsewhere(peg_demonstration, peg_model.spec, peg_task.scene).world
     config = SuggestConfig(max_radius=2.0, rotation_per_metre=0.1)
     found = suggest_radius(far, peg_demonstration, 0, config)
     assert 0.1 < found.radius < 1.0
@@ -231,7 +233,7 @@ def test_where_nothing_is_near_the_arm_itself_limits_a_radius(
 def test_a_joint_limit_and_a_singular_pose_limit_a_radius(
     peg_demonstration, peg_task, peg_model, monkeypatch
 ):
-    far = Elsewhere(peg_demonstration, peg_model.spec, peg_task.scene).surroundings
+    far = Elsewhere(peg_demonstration, peg_model.spec, peg_task.scene).world
     q = peg_demonstration.steps.joint_positions[0]
     monkeypatch.setattr(suggest_module, "_LEAST_SINGULAR_VALUE", 1.0)
     found = suggest_radius(far, peg_demonstration, 0)
@@ -249,45 +251,45 @@ def test_the_waypoint_that_a_segment_starts_from_must_be_clear_too(
     shown = dataclasses.replace(
         peg_demonstration, body_Ts_world={**peg_demonstration.body_Ts_world, "block": Ts}
     )
-    scene = DemonstratedScene(shown, peg_model.spec, peg_task.scene)
-    found = suggest_radius(ExactSurroundings(scene), shown, 0)
+    scene = ExactWorld(shown, peg_model.spec, peg_task.scene)
+    found = suggest_radius(scene, shown, 0)
     p = shown.steps.measured_Ts_world_tool[:, :3, 3]
     assert "at waypoint" in found.limited_by
     assert found.radius < np.linalg.norm(p[12] - p[0])
 
 
-def test_chosen_waypoints_are_annotated_in_order_without_repeats(peg_demonstration, peg_scene):
+def test_chosen_waypoints_are_annotated_in_order_without_repeats(peg_demonstration, peg_world):
     seen = []
-    annotation = suggested(peg_demonstration, peg_scene, [10, 0, 10], progress=seen.append)
+    annotation = suggested(peg_demonstration, peg_world, [10, 0, 10], progress=seen.append)
     assert [sphere.waypoint for sphere in annotation.spheres] == seen == [0, 10]
 
 
 @pytest.mark.parametrize("probes", [1, 10, 64])
 def test_any_number_of_probes_works_without_a_warning(
-    peg_task, peg_scene, peg_demonstration, probes
+    peg_task, peg_world, peg_demonstration, probes
 ):
-    annotation = suggested(peg_demonstration, peg_scene, [0], SuggestConfig(probes=probes))
+    annotation = suggested(peg_demonstration, peg_world, [0], SuggestConfig(probes=probes))
     assert annotation.spheres[0].radius > peg_task.placement_range
 
 
 @pytest.mark.parametrize("waypoint", [-1, 10_000])
-def test_a_waypoint_outside_the_demonstration_is_refused(peg_scene, peg_demonstration, waypoint):
+def test_a_waypoint_outside_the_demonstration_is_refused(peg_world, peg_demonstration, waypoint):
     with pytest.raises(InvalidInput, match=rf"waypoint {waypoint}: expected 0 to \d+"):
-        suggested(peg_demonstration, peg_scene, [waypoint])
+        suggested(peg_demonstration, peg_world, [waypoint])
 
 
-def test_the_last_waypoint_is_refused_for_nothing_follows_it(peg_scene, peg_demonstration):
+def test_the_last_waypoint_is_refused_for_nothing_follows_it(peg_world, peg_demonstration):
     last = len(peg_demonstration) - 1
     with pytest.raises(InvalidInput, match=f"waypoint {last}: expected 0 to {last - 1}"):
-        suggested(peg_demonstration, peg_scene, [last])
+        suggested(peg_demonstration, peg_world, [last])
 
 
-def test_where_no_waypoint_has_room_the_error_says_what_to_do(peg_scene, peg_demonstration):
+def test_where_no_waypoint_has_room_the_error_says_what_to_do(peg_world, peg_demonstration):
     config = SuggestConfig(min_radius=0.5, max_radius=0.5)
     with pytest.raises(InvalidInput, match="no waypoint has room for a sphere of 500.0 mm"):
-        suggested(peg_demonstration, peg_scene, config=config)
+        suggested(peg_demonstration, peg_world, config=config)
     with pytest.raises(InvalidInput, match="waypoint 0: no room .* clearance .* mm"):
-        suggested(peg_demonstration, peg_scene, [0], config=config)
+        suggested(peg_demonstration, peg_world, [0], config=config)
 
 
 @pytest.mark.parametrize(

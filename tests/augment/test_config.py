@@ -23,6 +23,17 @@ def test_an_unknown_allocation_is_refused():
         AugmentConfig(allocation="radios")
 
 
+def test_obstacles_known_from_elsewhere_are_refused():
+    with pytest.raises(UnknownName, match="unknown obstacles 'clouds': did you mean 'cloud'"):
+        AugmentConfig(obstacles="clouds")
+
+
+@pytest.mark.parametrize("name", ["margin", "slip_tolerance"])
+def test_a_negative_length_is_refused(name):
+    with pytest.raises(InvalidInput, match=f"{name}: expected a finite number >= 0 m, got -0.1"):
+        AugmentConfig(**{name: -0.1})
+
+
 @given(radii=radii, n=numbers)
 def test_equal_allocation_goes_round_robin(radii, n):
     expected = [len(range(i, n - 1, len(radii))) for i in range(len(radii))]

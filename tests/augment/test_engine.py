@@ -177,13 +177,11 @@ def test_the_measured_tool_follows_the_commands_and_the_join_is_smooth(strategy_
 
 
 def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_the_bit(
-    strategy_dataset, peg_backend, peg_annotation
+    strategy_dataset, peg_backend, peg_world, peg_annotation
 ):
     demonstration = strategy_dataset.sources[0].demonstration
     planner = SegmentPlanner(
-        peg_backend.robot,
-        peg_backend.scene,
-        demonstration,
+        peg_world,
         peg_annotation,
         AugmentConfig(strategy=strategy_dataset.info["config"]["strategy"]),
     )
@@ -562,8 +560,8 @@ from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
-from sart_toolkit.collision.demonstrated import DemonstratedScene
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.collision.exact import ExactWorld
+from sart_toolkit.annotate.suggest import suggest_annotation
 
 task = get_task("peg_in_hole")
 robot = get_robot(task.robot)
@@ -573,8 +571,8 @@ operator = ScriptedOperator(
     task.plan(task.initial_state(model, Placement())), np.random.default_rng(0)
 )
 demonstration = record_demonstration(make(), task, model, operator, seed=0)
-scene = DemonstratedScene(demonstration, robot, task.scene)
-annotation = suggest_annotation(demonstration, ExactSurroundings(scene))
+scene = ExactWorld(demonstration, robot, task.scene)
+annotation = suggest_annotation(demonstration, scene)
 config = AugmentConfig(n=5)
 dataset = augment_demonstration(demonstration, annotation, make, Path(sys.argv[1]), config)
 print()

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import Annotation, PrecisionSphere, convergence_waypoint
 from sart_toolkit.data.storage import load_demonstration, save_demonstration
@@ -54,13 +54,13 @@ def carried_at(task, model, shown):
 
 
 @pytest.fixture(scope="module")
-def surroundings(task, model, shown):
-    return ExactSurroundings(DemonstratedScene(shown, model.spec, task.scene))
+def world(task, model, shown):
+    return ExactWorld(shown, model.spec, task.scene)
 
 
 @pytest.fixture(scope="module")
-def annotation(shown, surroundings):
-    return suggest_annotation(shown, surroundings)
+def annotation(shown, world):
+    return suggest_annotation(shown, world)
 
 
 def sphere_at(shown, t, radius):
@@ -102,7 +102,7 @@ def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, carrie
 
 
 def test_a_waypoint_in_a_contact_or_at_the_gripper_s_event_is_refused_with_that_reason(
-    shown, surroundings, carried_at
+    shown, world, carried_at
 ):
     closing = next(s for s in range(len(shown)) if shown.steps.commanded_gripper[s] > 0.5)
     standing = carried_at.index({"toolbox"}) + 1
@@ -111,7 +111,7 @@ def test_a_waypoint_in_a_contact_or_at_the_gripper_s_event_is_refused_with_that_
         (standing, r"\(contact table / toolbox\)"),
     ):
         with pytest.raises(InvalidInput, match=rf"waypoint {t}: no room for a sphere .* {reason}"):
-            suggest_annotation(shown, surroundings, [t])
+            suggest_annotation(shown, world, [t])
 
 
 def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(

@@ -22,6 +22,7 @@ from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import make_backend
 from sart_toolkit.collision.certificate import certify
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     Annotation,
@@ -94,7 +95,8 @@ def config(strategy, **others):
 def make_planner(task, demonstration, annotate):
     def make_planner(strategy, kind="ball"):
         robot = get_robot(task.robot)
-        return SegmentPlanner(robot, task.scene, demonstration, annotate(kind), config(strategy))
+        world = ExactWorld(demonstration, robot, task.scene)
+        return SegmentPlanner(world, annotate(kind), config(strategy))
 
     return make_planner
 
@@ -143,7 +145,7 @@ def test_round_the_wall_every_draw_is_kept_but_those_that_touch_it_themselves(
 ):
     kept = [k for k in planned if is_kept(planned[k])]
     assert sum(not is_kept(straight[k]) for k in kept) >= 4
-    placed = make_planner("sart_planned").scene.placed(_t_star(make_planner))
+    placed = make_planner("sart_planned").world.placed(_t_star(make_planner))
     for k in kept:
         motion, certificate = planned[k]
         assert certificate.verdict == "free" and certificate.margin == AugmentConfig().margin

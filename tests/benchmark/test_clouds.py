@@ -5,7 +5,6 @@ import functools
 import numpy as np
 import pytest
 
-from sart_toolkit.annotate.suggest import ExactSurroundings
 from sart_toolkit.backends import make_backend
 from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.benchmark.clouds import _on_robot, benchmark_clouds
@@ -45,9 +44,8 @@ def test_the_cloud_s_points_lie_on_true_surfaces(compared):
     assert errors["on_robot"] == 0
 
 
-def test_a_point_on_the_robot_is_counted(peg_demonstration, peg_scene):
-    scene = ExactSurroundings(peg_scene)
+def test_a_point_on_the_robot_is_counted(peg_demonstration, peg_world):
     Ts = peg_demonstration.steps.measured_Ts_world_tool[:, :3, 3]
     points = np.array([Ts[0], Ts[-1], [0.0, 2.0, 0.0]])
-    assert _on_robot(points, scene, peg_demonstration, range(len(Ts))) == 2
-    assert _on_robot(points, scene, peg_demonstration, range(1)) == 1
+    assert _on_robot(points, peg_world, range(len(Ts))) == 2
+    assert _on_robot(points, peg_world, range(1)) == 1

@@ -16,7 +16,7 @@ import pytest
 from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.benchmark.radii import RadiiConfig, SphereTrial, benchmark_radii
 from sart_toolkit.cli import main
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.records import Annotation
 from sart_toolkit.errors import InvalidInput, Mismatch
 from sart_toolkit.robots import get_robot
@@ -34,9 +34,9 @@ class Interrupted(Exception):
 
 
 @pytest.fixture(scope="module")
-def trial(peg_task: Task, peg_scene: DemonstratedScene) -> Iterator[SphereTrial]:
+def trial(peg_task: Task, peg_world: ExactWorld) -> Iterator[SphereTrial]:
     with closing(ClosestPoints(get_robot(peg_task.robot), peg_task.scene)) as checker:
-        yield SphereTrial(peg_scene, checker, FEW)
+        yield SphereTrial(peg_world, checker, FEW)
 
 
 def test_suggested_spheres_hold_no_collision_and_somewhat_larger_ones_do(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import Attempt, RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
+from sart_toolkit.backends import make_backend
 from sart_toolkit.benchmark import segments
 from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.benchmark.segments import (
@@ -23,8 +25,9 @@ from sart_toolkit.benchmark.segments import (
     tool_off_path,
 )
 from sart_toolkit.cli import main
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.manifest import AttemptKey
-from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.data.records import Annotation
 from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
 from sart_toolkit.motion import timing
 from sart_toolkit.motion.timing import Motion
@@ -88,6 +91,22 @@ def test_segments_are_tallied_by_sphere_and_their_motions_checked(
     written = json.loads((tmp_path / "out.json").read_text())
     assert (written["cells"], written["command"]) == (result["cells"], "sart")
     assert [path.name for path in tmp_path.iterdir()] == ["out.json"]
+
+
+def test_against_the_cloud_nothing_is_proved_of_bodies_and_nothing_touches_them(
+    tmp_path: Path, peg_task: Task
+) -> None:
+    make = functools.partial(
+        make_backend, "pybullet", get_robot(peg_task.robot), peg_task.scene, 64
+    )
+    config = SegmentsConfig(4, obstacles="cloud")
+    result = benchmark_segments([Cell(peg_task, "pybullet", make)], config, tmp_path / "out.json")
+    row = result["cells"][PEG]
+    assert (row["attempted"], row["kept"], row["contacts"]) == (4, 4, 0)
+    assert {sphere["limited_by"] for sphere in row["spheres"]} <= {
+        "peg / cloud", "peg / cloud at waypoint 31"
+    }  # fmt: skip
+    assert result["config"]["obstacles"] == "cloud"
 
 
 def test_contacts_and_paths_that_were_left_are_told_apart_from_other_rejections(
@@ -172,16 +191,11 @@ def test_a_demonstration_that_fails_is_refused(
 
 
 @pytest.fixture(scope="module")
-def wide_motion(
-    peg_task: Task, peg_demonstration: Demonstration, peg_annotation: Annotation
-) -> tuple[Motion, Array]:
+def wide_motion(peg_world: ExactWorld, peg_annotation: Annotation) -> tuple[Motion, Array]:
     """A motion from the widest sphere, and the joints that it starts from."""
-    planner = SegmentPlanner(
-        get_robot(peg_task.robot), peg_task.scene, peg_demonstration, peg_annotation,
-        AugmentConfig(camera=None),
-    )  # fmt: skip
+    planner = SegmentPlanner(peg_world, peg_annotation, AugmentConfig(camera=None))
     proposal, rng = planner.proposal(0, 0)
-    q_start = peg_demonstration.steps.commanded_joint_positions[proposal.t_star]
+    q_start = peg_world.demonstration.steps.commanded_joint_positions[proposal.t_star]
     return planner.plan(proposal, rng)[0], q_start
 
 

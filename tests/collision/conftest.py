@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
+from sart_toolkit.backends import make_backend
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
+from sart_toolkit.data.records import Demonstration
 from sart_toolkit.poses import Array
+from sart_toolkit.record.scripted import ScriptedOperator
+from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
+from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.testing.clutter import CLUTTER
 
@@ -29,6 +37,41 @@ def start(peg_task: Task, peg_model: RobotModel) -> Start:
     state = peg_task.initial_state(peg_model, Placement())
     collision = CollisionModel(get_robot(peg_task.robot), peg_task.scene)
     return Start(collision, collision.placed(state.Ts_world_body, state.gripper), state)
+
+
+@pytest.fixture(scope="session")
+def recorded() -> Callable[[str], Demonstration]:
+    """A demonstration of a task by its scripted operator, without wrist pictures worth the name."""
+
+    @functools.cache
+    def recorded(name: str) -> Demonstration:
+        task = get_task(name)
+        model = RobotModel(get_robot(task.robot), task.scene.held)
+        backend = make_backend("pybullet", model.spec, task.scene, 16)
+        plan = task.plan(task.initial_state(model, Placement()))
+        operator = ScriptedOperator(plan, np.random.default_rng(0))
+        demonstration = record_demonstration(backend, task, model, operator, seed=0)
+        backend.close()
+        return demonstration
+
+    return recorded
+
+
+@pytest.fixture(scope="session")
+def toolbox() -> Task:
+    return get_task("toolbox_picking")
+
+
+@pytest.fixture(scope="session")
+def picked(recorded: Callable[[str], Demonstration], toolbox: Task) -> ExactWorld:
+    """A toolbox, approached, grasped and lifted off a table."""
+    return ExactWorld(recorded(toolbox.name), get_robot(toolbox.robot), toolbox.scene)
+
+
+@pytest.fixture(scope="session")
+def first_grasp(picked: ExactWorld) -> int:
+    """The waypoint at which the toolbox is first in the grasp."""
+    return [bool(phase.grasped) for phase in picked.phases].index(True)
 
 
 @pytest.fixture

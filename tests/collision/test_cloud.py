@@ -12,11 +12,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sart_toolkit.collision.cloud import (
-    CarriedObject,
     CloudConfig,
+    GraspedObject,
     SceneCloud,
-    carried_object,
     fuse_cloud,
+    grasped_object,
     surface_errors,
 )
 from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
@@ -306,7 +306,7 @@ def carrying(request, pictured, way_down):
 def test_what_was_carried_is_found_in_the_tool_frame(carrying, robot, before):
     demonstration = carrying
     config = CloudConfig(unknown="free")
-    found = carried_object(demonstration, robot, (), range(12, len(demonstration)), before, config)
+    found = grasped_object(demonstration, robot, (), range(12, len(demonstration)), before, config)
     assert len(found.points) > 30
     assert on_box(found.points, T_TOOL_BOX).all()
     # Its width is seen in full, to a pixel or two.
@@ -316,8 +316,8 @@ def test_what_was_carried_is_found_in_the_tool_frame(carrying, robot, before):
 def test_an_object_held_from_the_start_is_taken_to_be_as_deep_as_the_unknown(carrying, robot):
     demonstration = carrying
     after = range(12, len(demonstration))
-    visible = carried_object(demonstration, robot, (), after, config=CloudConfig(unknown="free"))
-    deep = carried_object(demonstration, robot, (), after)
+    visible = grasped_object(demonstration, robot, (), after, config=CloudConfig(unknown="free"))
+    deep = grasped_object(demonstration, robot, (), after)
     assert len(deep.points) == 2 * len(visible.points)
     shift = deep.points[len(visible.points) :] - visible.points
     np.testing.assert_allclose(np.linalg.norm(shift, axis=1), 0.03)
@@ -331,22 +331,22 @@ def test_what_was_taken_out_of_sight_is_found_where_pictures_look_through(
 ):
     T_box = way_down[12] @ T_TOOL_BOX
     taken = pictured(lambda t: [T_box] if t < 12 else [])
-    found = carried_object(taken, robot, (), range(12, len(taken)), range(12))
+    found = grasped_object(taken, robot, (), range(12, len(taken)), range(12))
     assert len(found.points) > 30
     assert on_box(found.points, T_TOOL_BOX).all()
 
 
 def test_nothing_is_carried_where_all_stays_or_the_tool_does_not_move(pictured, carrying, robot):
     still = pictured(lambda t: [BOX])
-    assert carried_object(still, robot, (), range(12, len(still)), range(12)) is None
-    assert carried_object(carrying, robot, (), range(12, 13), range(12)) is None
+    assert grasped_object(still, robot, (), range(12, len(still)), range(12)) is None
+    assert grasped_object(carrying, robot, (), range(12, 13), range(12)) is None
 
 
 def test_what_was_carried_is_no_part_of_the_scene_before_or_after(carrying, robot):
     demonstration = carrying
     n = len(demonstration)
-    found = carried_object(demonstration, robot, (), range(12, n), range(12))
-    cloud = fuse_cloud(demonstration, robot, (), carried=[found])
+    found = grasped_object(demonstration, robot, (), range(12, n), range(12))
+    cloud = fuse_cloud(demonstration, robot, (), grasped=[found])
     assert np.abs(seen(cloud)[:, 2] - FLOOR).max() < 1e-3
     smeared = fuse_cloud(demonstration, robot, ())
     assert (seen(smeared)[:, 2] > FLOOR + 0.01).sum() > 30
@@ -371,19 +371,20 @@ def cube():
 
 def test_the_distance_to_a_point_is_that_to_its_ball(cube):
     obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.05]], inflation=0.002))
-    (found,) = obstacles.distances(cube, pose([0.0, 0.003, 0.0]), 0.0)
-    assert found.body == "cube"
-    assert found.distance == pytest.approx(0.038, abs=1e-6)
-    np.testing.assert_allclose(found.normal, [0, 0, -1], atol=1e-6)
-    np.testing.assert_allclose(found.p_cloud, [0, 0, 0.05])
+    T = pose([0.0, 0.003, 0.0])
+    (found,) = obstacles.separations(cube, T, 0.0)
+    assert found.distance == obstacles.distance(cube, T) == pytest.approx(0.038, abs=1e-6)
+    np.testing.assert_allclose(found.p_ball, [0, 0, 0.048], atol=1e-6)
     np.testing.assert_allclose(found.p_part, [0, 0, 0.01], atol=1e-6)
 
 
 def test_a_point_inside_a_part_is_as_deep_as_the_nearest_face_and_its_ball(cube):
     obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.007]], inflation=0.002))
-    (found,) = obstacles.distances(cube, np.eye(4), 0.0)
+    (found,) = obstacles.separations(cube, np.eye(4), 0.0)
     assert found.distance == pytest.approx(-0.005, abs=1e-5)
-    np.testing.assert_allclose(found.normal, [0, 0, -1], atol=1e-4)
+    # The ball has to go up by that, and the cube down.
+    np.testing.assert_allclose(found.p_ball, [0, 0, 0.005], atol=1e-5)
+    np.testing.assert_allclose(found.p_part, [0, 0, 0.01], atol=1e-5)
 
 
 @pytest.mark.parametrize("within", [0.0, 0.01, 0.05])
@@ -398,15 +399,13 @@ def test_no_point_that_is_near_enough_is_missed(peg_model, within):
         cloud = cloud_of(p @ T[:3, :3].T + T[:3, 3])
         obstacles = CloudObstacles(cloud)
         exact = np.array([one_by_one(obstacles, part, T, q) for q in cloud.points])
-        found = obstacles.distances(part, T, within)
+        found = obstacles.separations(part, T, within)
         distances = [each.distance for each in found]
         assert distances == sorted(distances)
         wanted = np.sort(exact[exact <= exact.min() + within - 1e-6])
         np.testing.assert_allclose(distances[: len(wanted)], wanted, atol=2e-6)
         assert len(distances) >= len(wanted)
-        assert obstacles.nearest([(part, T)]).distance == pytest.approx(exact.min(), abs=2e-6)
-        assert obstacles.any_within([(part, T)], exact.min() - 1e-5) is None
-        assert obstacles.any_within([(part, T)], exact.min() + 1e-5) == part.body
+        assert obstacles.distance(part, T) == pytest.approx(exact.min(), abs=2e-6)
 
 
 def one_by_one(obstacles, part, T, p):
@@ -418,20 +417,15 @@ def one_by_one(obstacles, part, T, p):
     )
 
 
-def test_the_nearest_of_several_parts_and_the_one_too_near_are_told_by_name(cube):
-    other = hull_part("other", 1, CUBE)
-    obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.0]]))
-    parts = [(cube, pose([0.1, 0, 0])), (other, pose([0, 0.05, 0]))]
-    assert obstacles.nearest(parts).body == "other"
-    assert obstacles.any_within(parts, 0.045) == "other"
-    assert obstacles.any_within(parts, 0.03) is None
+def test_clearances_are_distances_of_bare_points_from_the_nearest_ball():
+    obstacles = CloudObstacles(cloud_of([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], inflation=0.002))
+    p = np.array([[[0.0, 0.0, 0.1], [1.0, 0.001, 0.0]]])
+    np.testing.assert_allclose(obstacles.clearances(p), [[0.098, -0.001]], atol=1e-12)
 
 
-def test_an_empty_cloud_is_near_to_nothing(cube):
-    obstacles = CloudObstacles(cloud_of([]))
-    assert obstacles.distances(cube, np.eye(4), 0.1) == []
-    assert obstacles.nearest([(cube, np.eye(4))]) is None
-    assert obstacles.any_within([(cube, np.eye(4))], 1.0) is None
+def test_a_cloud_without_points_is_no_obstacle_but_a_mistake():
+    with pytest.raises(InvalidInput, match="cloud: expected at least one point, got none; look"):
+        CloudObstacles(cloud_of([]))
 
 
 # --- the yardstick ------------------------------------------------------------------------------
@@ -492,7 +486,7 @@ def test_a_waypoint_out_of_range_is_refused(peg_demonstration, robot, waypoints)
     with pytest.raises(InvalidInput, match=r"waypoint (-1|10000): expected 0 to \d+; choose"):
         fuse_cloud(peg_demonstration, robot, (), waypoints)
     with pytest.raises(InvalidInput, match=r"waypoint (-1|10000): expected 0 to \d+; choose"):
-        carried_object(peg_demonstration, robot, (), waypoints)
+        grasped_object(peg_demonstration, robot, (), waypoints)
 
 
 def test_no_waypoint_at_all_is_refused(peg_demonstration, robot):
@@ -505,12 +499,12 @@ def test_another_robot_is_refused(peg_demonstration):
         fuse_cloud(peg_demonstration, get_robot("ur5e_hande"), ())
 
 
-def test_a_carried_object_is_made_of_points_and_waypoints():
-    assert CarriedObject(CUBE, (1, 2)).points.shape == (8, 3)
-    with pytest.raises(InvalidInput, match="waypoints of a carried object: expected at least one"):
-        CarriedObject(CUBE, ())
+def test_a_grasped_object_is_made_of_points_and_waypoints():
+    assert GraspedObject(CUBE, (1, 2)).points.shape == (8, 3)
+    with pytest.raises(InvalidInput, match="waypoints of a grasped object: expected at least one"):
+        GraspedObject(CUBE, ())
     with pytest.raises(InvalidInput, match="points: expected shape"):
-        CarriedObject(np.zeros(3), (1,))
+        GraspedObject(np.zeros(3), (1,))
 
 
 @pytest.mark.parametrize("points", [CUBE[:3], CUBE * [1, 1, 0]], ids=["three", "flat"])

@@ -682,11 +682,9 @@ def test_distances_are_those_of_pybullet(robot, peg_task, rng):
 def rough_distances(placed, q):
     """What spheres and boxes say of each pair's distance."""
     bounds = placed.bounds
-    centres, axes, middles = (each[0] for each in bounds.placed(placed.joint_poses(q)[None]))
     every = np.arange(len(placed.pairs))
-    return bounds.rough_distances(
-        centres[bounds.first], axes[bounds.second], middles[bounds.second], every
-    )
+    enclosures = bounds.placed(placed.joint_poses(q)[None])
+    return bounds.rough_distances(enclosures, np.zeros_like(every), every)
 
 
 def assert_not_above(rough, exact):
@@ -714,7 +712,7 @@ def test_rough_distances_are_never_above_true_ones_whatever_is_carried(rods, see
     rng = np.random.default_rng(seed)
     Ts = {"wire": random_pose(rng, 0.6), "rod": random_pose(rng, 0.6)}
     in_grasp = {"rod": random_pose(rng, 0.3)} if carried else None
-    placed = rods.placed(Ts, rng.uniform(), in_grasp, grasp_play=play)
+    placed = rods.placed(Ts, rng.uniform(), in_grasp, slip_tolerance=play)
     q = joints_near(placed, rng)
     assert_not_above(rough_distances(placed, q), placed.distances(q))
 
@@ -724,7 +722,7 @@ def test_spheres_and_boxes_enclose_what_they_stand_for(cluttered, kind, rng):
     placed = cluttered[kind]
     bounds = placed.bounds
     q = joints_near(placed, rng)
-    centres, axes, middles = (each[0] for each in bounds.placed(placed.joint_poses(q)[None]))
+    centres, axes, middles, _ = (each[0] for each in bounds.placed(placed.joint_poses(q)[None]))
     world = [
         part.points @ T[:3, :3].T + T[:3, 3]
         for part, (_, T) in zip(placed.parts, poses_of_parts(placed, q), strict=True)
@@ -748,7 +746,7 @@ def test_all_that_is_carried_is_nearer_by_its_play_and_nothing_else_is(rods, see
     rng = np.random.default_rng(seed)
     Ts, T_tool_rod = {"wire": random_pose(rng, 0.6)}, random_pose(rng, 0.3)
     tight = rods.placed(Ts, 0.2, {"rod": T_tool_rod})
-    loose = rods.placed(Ts, 0.2, {"rod": T_tool_rod}, grasp_play=play)
+    loose = rods.placed(Ts, 0.2, {"rod": T_tool_rod}, slip_tolerance=play)
     q = joints_near(loose, rng)
     carried = np.array([loose.names(k)[0] == "rod" for k in range(len(loose.pairs))])
     assert 0 < carried.sum() < len(carried)
@@ -774,7 +772,7 @@ def test_rough_distances_take_the_play_into_account():
     T = collision.kinematics.fk(q)
     Ts = {"block": pose(T[:3, 3] - [0, 0, 0.2 + 0.05 + 0.5])}
     for play in (0.0, 0.02):
-        placed = collision.placed(Ts, 0.0, {"pole": np.eye(4)}, grasp_play=play)
+        placed = collision.placed(Ts, 0.0, {"pole": np.eye(4)}, slip_tolerance=play)
         (k,) = by_names(placed)["pole", "block"]
         assert placed.distances(q)[k] == pytest.approx(0.05 - play, abs=ACCURACY)
         assert rough_distances(placed, q)[k] == pytest.approx(0.05 - play, abs=1e-4)
@@ -783,8 +781,8 @@ def test_rough_distances_take_the_play_into_account():
 
 @pytest.mark.parametrize("play", [-1e-6, np.nan, np.inf])
 def test_a_play_that_is_negative_or_not_finite_is_refused(rods, play):
-    with pytest.raises(InvalidInput, match="grasp_play: expected a finite number >= 0 m, got"):
-        rods.placed({"wire": FAR}, 0.0, {"rod": np.eye(4)}, grasp_play=play)
+    with pytest.raises(InvalidInput, match="slip_tolerance: expected a finite number >= 0 m, got"):
+        rods.placed({"wire": FAR}, 0.0, {"rod": np.eye(4)}, slip_tolerance=play)
 
 
 # --- other questions ----------------------------------------------------------------------------
@@ -897,7 +895,7 @@ def test_a_body_whose_pose_is_missing_is_told(start):
 
 def test_a_carried_body_that_the_scene_has_not_is_told(start):
     Ts = start.state.Ts_world_body
-    with pytest.raises(UnknownName, match="unknown carried body 'blok': did you mean 'block'"):
+    with pytest.raises(UnknownName, match="unknown grasped body 'blok': did you mean 'block'"):
         start.collision.placed(Ts, 0.0, {"blok": np.eye(4)})
 
 

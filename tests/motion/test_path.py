@@ -154,7 +154,7 @@ def test_a_polyline_keeps_its_configurations():
 def test_a_polyline_has_no_bulge_between_neighbours(seed, i, a, b):
     path = polyline(seed, 10)
     start, end = sorted([(i + a) / 9, (i + b) / 9])
-    assert path.bulge(np.array([start]), np.array([end])).max() < 1e-9
+    assert path.chord_deviation(np.array([start]), np.array([end])).max() < 1e-9
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -190,7 +190,7 @@ def off_the_chord(path, start, end, allowed, n=200):
 def test_the_path_is_never_farther_from_a_chord_than_the_bulge(path, ends, zoom):
     start, end = sorted(ends)
     end = start + zoom * (end - start)
-    (allowed,) = path.bulge(np.array([start]), np.array([end]))
+    (allowed,) = path.chord_deviation(np.array([start]), np.array([end]))
     assert allowed.shape == (6,)
     assert not off_the_chord(path, start, end, allowed)
 
@@ -203,7 +203,7 @@ def test_the_path_is_never_farther_from_chords_between_its_own_points_than_the_b
     # Where a polyline's corners are exactly on the intervals' ends.
     path = polyline(seed, count)
     s = np.linspace(0, 1, count)[::k]
-    for start, end, allowed in zip(s[:-1], s[1:], path.bulge(s[:-1], s[1:]), strict=True):
+    for start, end, allowed in zip(s[:-1], s[1:], path.chord_deviation(s[:-1], s[1:]), strict=True):
         assert not off_the_chord(path, start, end, allowed)
 
 
@@ -211,9 +211,11 @@ def test_the_path_is_never_farther_from_chords_between_its_own_points_than_the_b
 @given(path=paths, parts=st.integers(1, 12))
 def test_bulges_of_many_intervals_are_those_of_each(path, parts):
     s = np.linspace(0, 1, parts + 1)
-    together = path.bulge(s[:-1], s[1:])
+    together = path.chord_deviation(s[:-1], s[1:])
     for row, start, end in zip(together, s[:-1], s[1:], strict=True):
-        np.testing.assert_array_equal(path.bulge(np.array([start]), np.array([end]))[0], row)
+        np.testing.assert_array_equal(
+            path.chord_deviation(np.array([start]), np.array([end]))[0], row
+        )
 
 
 @PROPERTY
@@ -222,7 +224,7 @@ def test_finer_intervals_bulge_less(path):
     greatest = []
     for parts in (1, 8, 64, 4096):
         s = np.linspace(0, 1, parts + 1)
-        greatest.append(path.bulge(s[:-1], s[1:]).max())
+        greatest.append(path.chord_deviation(s[:-1], s[1:]).max())
     if isinstance(path, SplinePath):
         assert greatest == sorted(greatest, reverse=True)
     assert greatest[-1] <= 0.5 * greatest[0] + 1e-12
@@ -230,10 +232,10 @@ def test_finer_intervals_bulge_less(path):
 
 def test_a_way_there_and_back_bulges_by_all_of_it():
     path = PolylinePath([np.zeros(3), [1.0, 0.5, 0.0], np.zeros(3)])
-    np.testing.assert_allclose(path.bulge(np.zeros(1), np.ones(1)), [[1.0, 0.5, 0.0]])
+    np.testing.assert_allclose(path.chord_deviation(np.zeros(1), np.ones(1)), [[1.0, 0.5, 0.0]])
     # From a third there and a third back: two thirds of the way on.
     third = np.array([1 / 3]), np.array([2 / 3])
-    np.testing.assert_allclose(path.bulge(*third), [[1 / 3, 1 / 6, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(path.chord_deviation(*third), [[1 / 3, 1 / 6, 0.0]], atol=1e-12)
 
 
 @pytest.mark.parametrize("make", [SplinePath.through, PolylinePath])

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from sart_toolkit.collision.certificate import certify
-from sart_toolkit.collision.model import CollisionModel, PlacedModel
+from sart_toolkit.collision.cloud import CloudConfig, SceneCloud
+from sart_toolkit.collision.model import CLOUD, CollisionModel, PlacedModel
+from sart_toolkit.collision.obstacles import CloudObstacles
 from sart_toolkit.errors import InvalidInput, MissingExtra, MotionRejected, Unreachable
 from sart_toolkit.motion import planning
 from sart_toolkit.motion.path import PolylinePath
@@ -97,6 +99,33 @@ def planned(plan, goals):
 @pytest.fixture
 def without_ompl(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl", None)
+
+
+# --- round a cloud ------------------------------------------------------------------------------
+
+
+def test_round_a_post_that_is_known_by_points_alone_the_path_is_clear_of_the_post(
+    placed, start, goals
+):
+    pytest.importorskip("ompl")
+    half, spacing = np.array(POST.shapes[0].size) / 2, 0.012
+    axes = [np.linspace(-h, h, 1 + int(np.ceil(2 * h / spacing))) for h in half]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    points = grid[(np.abs(grid) > half - 1e-9).any(1)] + POST.T_world_body[:3, 3]
+    # Balls that cover the faces between the points.
+    config = CloudConfig(inflation=spacing / np.sqrt(2))
+    n = len(points)
+    seen = SceneCloud(points, np.zeros((n, 3), np.uint8), np.zeros(n, bool), config)
+    collision = CollisionModel(get_robot("ur5e_2f85"), SceneSpec((), held=(PEG,)))
+    cloud = collision.placed({}, 0.67, cloud=CloudObstacles(seen))
+    goal = next(q for q in goals if cloud.nearest(q).distance > 0.01)
+    direct = certify(cloud, PolylinePath(np.array([start, goal])), MARGIN)
+    assert (direct.verdict, direct.pair[1]) == ("collision", CLOUD)
+    path, certificate = plan_path(cloud, start, goal, MARGIN, np.random.default_rng(0))
+    assert certificate.verdict == "free" and certificate.clearance >= MARGIN
+    post = [k for k in range(len(placed.pairs)) if placed.names(k)[1] == "post"]
+    along = path.positions(np.linspace(0, 1, 200))
+    assert min(min(placed.pair_distances(q, post)) for q in along) >= MARGIN
 
 
 # --- what a planned path is ---------------------------------------------------------------------

@@ -8,11 +8,11 @@ import functools
 import numpy as np
 import pytest
 
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import make_backend
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
@@ -88,15 +88,15 @@ def test_what_is_carried_moves_with_the_tool_in_a_segment(tmp_path):
     plan = task.plan(task.initial_state(model, Placement()))
     operator = ScriptedOperator(plan, np.random.default_rng(0))
     shown = record_demonstration(backend, task, model, operator)
-    scene = DemonstratedScene(shown, robot, task.scene)
-    carried = [t for t, phase in enumerate(scene.phases) if phase.carried]
-    spheres = suggest_annotation(shown, ExactSurroundings(scene), [carried[len(carried) // 2]])
+    scene = ExactWorld(shown, robot, task.scene)
+    carried = [t for t, phase in enumerate(scene.phases) if phase.grasped]
+    spheres = suggest_annotation(shown, scene, [carried[len(carried) // 2]])
     made = augment_demonstration(shown, spheres, make, tmp_path / "d", AugmentConfig(n=2))
     playback = Playback("episode.h5", shown, made.episode(0))
     SceneView(playback, backend, "overview").picture(0, 32)
     now = backend.observe()
     t = playback.waypoint(0)
-    (name,) = scene.phases[t].carried
+    (name,) = scene.phases[t].grasped
     was = np.linalg.inv(shown.steps.measured_Ts_world_tool[t]) @ shown.body_Ts_world[name][t]
     np.testing.assert_allclose(
         np.linalg.inv(now.T_world_tool) @ now.Ts_world_body[name], was, atol=1e-4

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.collision.demonstrated import DemonstratedScene
+from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel
 from sart_toolkit.data.records import RECORD_HZ
 from sart_toolkit.errors import InvalidInput, UnknownName
@@ -193,8 +193,8 @@ def test_a_sphere_at_the_start_covers_every_placement(task, model):
     config = SessionConfig(cameras=(), keep_states=False)
     demonstration = record_demonstration(backend, task, model, operator, config=config)
     backend.close()
-    scene = DemonstratedScene(demonstration, model.spec, task.scene)
-    annotation = suggest_annotation(demonstration, ExactSurroundings(scene), [0])
+    scene = ExactWorld(demonstration, model.spec, task.scene)
+    annotation = suggest_annotation(demonstration, scene, [0])
     assert annotation.spheres[0].radius >= np.hypot(*[task.placement_range] * 2)
 
 

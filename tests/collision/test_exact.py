@@ -1,64 +1,26 @@
 """The scene at each waypoint: bodies where they were seen, what is grasped at the tool."""
 
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
 
-from sart_toolkit.backends import make_backend
-from sart_toolkit.collision.demonstrated import (
-    GRASP_PLAY,
-    DemonstratedScene,
-    Phase,
-    demonstration_phases,
-)
+from sart_toolkit.collision.exact import ExactWorld
+from sart_toolkit.collision.phases import IN_GRASP_SLIP
 from sart_toolkit.errors import InvalidInput, Mismatch
 from sart_toolkit.poses import inverse
-from sart_toolkit.record.scripted import ScriptedOperator
-from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
 from sart_toolkit.scenes.spec import Body
 from sart_toolkit.tasks import get_task
-from sart_toolkit.tasks.task import Placement
-
-
-@pytest.fixture(scope="module")
-def toolbox():
-    return get_task("toolbox_picking")
-
-
-@functools.cache
-def recorded(name):
-    """A demonstration of a task by its scripted operator, without wrist pictures worth the name."""
-    task = get_task(name)
-    model = RobotModel(get_robot(task.robot), task.scene.held)
-    backend = make_backend("pybullet", model.spec, task.scene, 16)
-    stages = task.plan(task.initial_state(model, Placement()))
-    operator = ScriptedOperator(stages, np.random.default_rng(0))
-    demonstration = record_demonstration(backend, task, model, operator, seed=0)
-    backend.close()
-    return demonstration
-
-
-@pytest.fixture(scope="module")
-def picked(toolbox):
-    """A toolbox, approached, grasped and lifted off a table."""
-    return DemonstratedScene(recorded(toolbox.name), get_robot(toolbox.robot), toolbox.scene)
-
-
-def first_grasp(scene):
-    return [bool(phase.carried) for phase in scene.phases].index(True)
-
 
 # --- where bodies are ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("when", ["before the grasp", "in the grasp", "at the end"])
-def test_all_bodies_are_where_they_were_seen(picked, when):
-    shown, grasped = picked.demonstration, first_grasp(picked)
+def test_all_bodies_are_where_they_were_seen(picked, when, first_grasp):
+    shown, grasped = picked.demonstration, first_grasp
     t = {"before the grasp": 5, "in the grasp": grasped + 3, "at the end": len(shown) - 1}[when]
     placed = picked.placed(t)
     joints = placed.joint_poses(shown.steps.joint_positions[t])
@@ -75,8 +37,8 @@ def test_all_bodies_are_where_they_were_seen(picked, when):
     assert seen == {"table", "toolbox"}
 
 
-def test_what_is_grasped_moves_with_the_tool_and_is_no_obstacle(picked, rng):
-    t = first_grasp(picked) + 10
+def test_what_is_grasped_moves_with_the_tool_and_is_no_obstacle(picked, rng, first_grasp):
+    t = first_grasp + 10
     placed, steps = picked.placed(t), picked.demonstration.steps
     carried = [part for part in placed.parts if part.body == "toolbox"]
     assert {part.joint for part in carried} == {6}
@@ -94,20 +56,20 @@ def test_what_is_grasped_moves_with_the_tool_and_is_no_obstacle(picked, rng):
     distances = placed.distances(q)
     found = [d for k, d in enumerate(distances) if placed.names(k) == ("toolbox", "table")]
     # A prism about a cylinder may reach a little lower, and it may move in the grasp.
-    assert lowest - 1e-5 <= min(found) + picked.grasp_play <= lowest + 5e-3
+    assert lowest - 1e-5 <= min(found) + picked.slip_tolerance <= lowest + 5e-3
 
 
-def test_what_is_not_grasped_stands_and_is_an_obstacle(picked):
-    placed = picked.placed(first_grasp(picked) - 3)
+def test_what_is_not_grasped_stands_and_is_an_obstacle(picked, first_grasp):
+    placed = picked.placed(first_grasp - 3)
     assert {part.joint for part in placed.parts if part.body == "toolbox"} == {0}
     assert "toolbox" in {placed.names(k)[1] for k in placed.tool_pairs()}
 
 
-def test_fingers_are_as_far_open_as_they_were_measured(picked):
+def test_fingers_are_as_far_open_as_they_were_measured(picked, first_grasp):
     spec = picked.collision.robot
     left, right = spec.gripper.finger_links
     widths = []
-    for t in (0, first_grasp(picked) + 5):
+    for t in (0, first_grasp + 5):
         gripper = picked.demonstration.steps.measured_gripper[t]
         poses = RobotModel(spec, (), gripper).link_poses(spec.home)
         expected = np.linalg.norm(poses[left][:3, 3] - poses[right][:3, 3])
@@ -123,27 +85,27 @@ def test_fingers_are_as_far_open_as_they_were_measured(picked):
     assert widths[0][0] - widths[1][0] > 0.02
 
 
-def test_a_demonstration_did_not_go_through_anything(picked, peg_scene):
-    for scene in (picked, peg_scene):
+def test_a_demonstration_did_not_go_through_anything(picked, peg_world):
+    for scene in (picked, peg_world):
         steps = scene.demonstration.steps
         for t in range(0, len(scene.demonstration), 5):
             placed = scene.placed(t)
-            distances = placed.distances(steps.joint_positions[t]) + placed.play
+            distances = placed.distances(steps.joint_positions[t]) + placed.slip
             # Contacts of the simulation give way by less than a millimetre.
             assert distances.min() > -1e-3
 
 
-def test_what_is_carried_may_move_in_the_grasp_by_its_play(picked, toolbox):
-    t = first_grasp(picked) + 10
-    assert picked.grasp_play == GRASP_PLAY == 0.005
-    tight = DemonstratedScene(
-        picked.demonstration, get_robot(toolbox.robot), toolbox.scene, grasp_play=0.0
+def test_what_is_carried_may_move_in_the_grasp_by_its_play(picked, toolbox, first_grasp):
+    t = first_grasp + 10
+    assert picked.slip_tolerance == IN_GRASP_SLIP == 0.005
+    tight = ExactWorld(
+        picked.demonstration, get_robot(toolbox.robot), toolbox.scene, slip_tolerance=0.0
     )
     for scene, play in ((picked, 0.005), (tight, 0.0)):
         placed = scene.placed(t)
         carried = np.array([placed.names(k)[0] == "toolbox" for k in range(len(placed.pairs))])
-        np.testing.assert_array_equal(placed.play, play * carried)
-        assert not scene.placed(3).play.any()
+        np.testing.assert_array_equal(placed.slip, play * carried)
+        assert not scene.placed(3).slip.any()
 
 
 def test_a_scene_is_put_together_once_for_each_waypoint(picked):
@@ -151,10 +113,10 @@ def test_a_scene_is_put_together_once_for_each_waypoint(picked):
     assert picked.placed(7) is not picked.placed(8)
 
 
-def test_a_door_is_where_it_was_at_each_waypoint():
+def test_a_door_is_where_it_was_at_each_waypoint(recorded):
     task = get_task("door_opening")
     shown = recorded(task.name)
-    scene = DemonstratedScene(shown, get_robot(task.robot), task.scene)
+    scene = ExactWorld(shown, get_robot(task.robot), task.scene)
     for t in (0, len(shown) - 1):
         parts = [part for part in scene.placed(t).parts if part.body == "door"]
         assert {part.joint for part in parts} == {0}
@@ -167,78 +129,6 @@ def test_a_door_is_where_it_was_at_each_waypoint():
     assert np.abs(start - end).max() > 0.1
 
 
-# --- phases -------------------------------------------------------------------------------------
-
-
-def test_phases_tell_approach_grasp_and_lift_apart(picked):
-    phases, shown = picked.phases, picked.demonstration
-    assert len(phases) == len(shown)
-    changes = [
-        (t, before.change(after))
-        for t, (before, after) in enumerate(zip(phases[:-1], phases[1:], strict=True))
-        if before != after
-    ]
-    words = [what for _, what in changes]
-    assert words.index("gripper command") < words.index("grasp of toolbox")
-    assert words.index("grasp of toolbox") < words.index("contact table / toolbox")
-    grasped = first_grasp(picked)
-    assert all(phase.carried == {"toolbox"} for phase in phases[grasped:])
-    assert all(phase.carried == frozenset() for phase in phases[:grasped])
-    commands = np.round(shown.steps.commanded_gripper, 2)
-    np.testing.assert_array_equal([phase.gripper for phase in phases], commands)
-
-
-def test_what_stands_on_something_else_is_no_contact_of_the_robots(picked):
-    # The toolbox stands on the table; only once it is carried is that a contact.
-    grasped = first_grasp(picked)
-    assert ("table", "toolbox") in picked.demonstration.touching[grasped - 5]
-    assert picked.phases[grasped - 5].contacts == frozenset()
-    assert {frozenset(pair) for pair in picked.phases[grasped].contacts} == {
-        frozenset(("table", "toolbox"))
-    }
-
-
-def test_before_the_first_step_all_is_as_after_it_but_for_the_gripper(picked):
-    shown = picked.demonstration
-    touched = (("table", "wrist_camera"),)
-    told = dataclasses.replace(
-        shown, touching=((), touched, *shown.touching[2:]),
-        steps=dataclasses.replace(
-            shown.steps,
-            commanded_gripper=np.concatenate([[0.25], shown.steps.commanded_gripper[1:]]),
-        ),
-    )  # fmt: skip
-    first, second, *_ = demonstration_phases(told, picked.collision.robot, picked.collision.scene)
-    assert first.contacts == second.contacts == {("table", "wrist_camera")}
-    assert (first.gripper, second.gripper) == (0.25, round(shown.steps.commanded_gripper[1], 2))
-
-
-def test_a_gripper_command_that_is_hardly_another_is_the_same_phase(picked):
-    shown = picked.demonstration
-    command = np.tile([0.301, 0.299], len(shown))[: len(shown)]
-    told = dataclasses.replace(
-        shown,
-        touching=((),) * len(shown),
-        steps=dataclasses.replace(shown.steps, commanded_gripper=command),
-    )
-    phases = demonstration_phases(told, picked.collision.robot, picked.collision.scene)
-    assert set(phases) == {Phase(0.3, frozenset(), frozenset())}
-
-
-@pytest.mark.parametrize(
-    ("after", "what"),
-    [
-        (Phase(0.6, frozenset({"mug"}), frozenset()), "gripper command"),
-        (Phase(0.5, frozenset({"mug", "box"}), frozenset()), "grasp of box, mug"),
-        (Phase(0.5, frozenset(), frozenset({("a", "c"), ("a", "b")})), "contact a / b"),
-    ],
-)
-def test_a_change_says_what_changed(after, what):
-    before = Phase(0.5, frozenset(), frozenset())
-    assert before.change(after) == what
-    assert after.change(before) == what
-
-
 # --- errors -------------------------------------------------------------------------------------
 
 
@@ -249,7 +139,7 @@ def test_a_demonstration_that_does_not_tell_where_a_body_was_is_refused(picked, 
     with pytest.raises(
         Mismatch, match="doesn't tell where 'toolbox' was, so nothing can be proved"
     ):
-        DemonstratedScene(blind, get_robot(toolbox.robot), toolbox.scene)
+        ExactWorld(blind, get_robot(toolbox.robot), toolbox.scene)
 
 
 def test_a_scene_of_which_a_body_does_not_collide_is_refused(picked, toolbox):
@@ -259,4 +149,4 @@ def test_a_scene_of_which_a_body_does_not_collide_is_refused(picked, toolbox):
     Ts = {**shown.body_Ts_world, "ghost": np.tile(np.eye(4), (len(shown), 1, 1))}
     told = dataclasses.replace(shown, body_Ts_world=Ts)
     with pytest.raises(InvalidInput, match="body 'ghost': no shape of it collides"):
-        DemonstratedScene(told, get_robot(toolbox.robot), scene)
+        ExactWorld(told, get_robot(toolbox.robot), scene)

@@ -1,0 +1,142 @@
+"""What suggestion and augmentation ask about obstacles, however these are known."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Literal
+
+import numpy as np
+
+from sart_toolkit.collision.certificate import Certificate, JointPath, certify
+from sart_toolkit.collision.cloud import CloudConfig
+from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.collision.phases import IN_GRASP_SLIP, demonstration_phases
+from sart_toolkit.data.records import Demonstration
+from sart_toolkit.errors import Mismatch, MotionRejected, unknown_name
+from sart_toolkit.poses import Array
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.scenes.spec import SceneSpec
+
+Source = Literal["scene", "cloud"]
+SOURCES: tuple[Source, ...] = ("scene", "cloud")
+
+
+class CollisionWorld(ABC):
+    """Robot and obstacles as they were at each waypoint of a demonstration.
+
+    Attributes:
+        demonstration: what was shown.
+        phases: the phase of each waypoint.
+        slip_tolerance: how far [m] a grasped object may move in the grasp.
+    """
+
+    def __init__(
+        self,
+        demonstration: Demonstration,
+        robot: RobotSpec,
+        scene: SceneSpec,
+        slip_tolerance: float,
+    ) -> None:
+        """Tell the demonstration's phases apart.
+
+        Raises:
+            Mismatch: the demonstration is of another robot.
+        """
+        if demonstration.robot != robot.name:
+            raise Mismatch(
+                f"the demonstration is of robot {demonstration.robot!r}, not {robot.name!r}; give "
+                "its own"
+            )
+        self.demonstration = demonstration
+        self.slip_tolerance = slip_tolerance
+        self.phases = demonstration_phases(demonstration, robot, scene)
+
+    @property
+    @abstractmethod
+    def kinematics(self) -> RobotModel:
+        """The robot."""
+
+    @abstractmethod
+    def placed(self, t: int) -> PlacedModel:
+        """Robot and obstacles as at waypoint `t`; what was in the grasp moves with the tool."""
+
+    @abstractmethod
+    def moving(self, t: int) -> str | None:
+        """The name of an obstacle that is known not to stand still at waypoint `t`, or None."""
+
+    def unknown(self, t: int) -> str | None:
+        """What isn't known at waypoint `t`, so that nothing can be proved there, or None."""
+        return None
+
+    def check_known(self, t: int) -> None:
+        """Return if all is known that proofs at waypoint `t` are about.
+
+        Raises:
+            MotionRejected: something isn't.
+        """
+        unknown = self.unknown(t)
+        if unknown is not None:
+            raise MotionRejected(
+                f"{unknown}: nothing can be proved at waypoint {t}; choose other waypoints"
+            )
+
+    def too_close(self, t: int, q: Array, margin: float) -> str | None:
+        """The names of the nearest pair at joints `q (n,)` if it is nearer than the margin [m].
+
+        Raises:
+            InvalidInput: `q` has the wrong shape or isn't finite.
+        """
+        pair = self.placed(t).too_close(q, margin)
+        return None if pair is None else " / ".join(pair)
+
+    def certify(self, t: int, path: JointPath, margin: float = 0.0) -> Certificate:
+        """A proof that a joint path keeps clear of the obstacles of waypoint `t`, or where not.
+
+        Raises:
+            MotionRejected: not all is known that there is at the waypoint.
+            InvalidInput: the margin is negative, or the path not finite.
+        """
+        self.check_known(t)
+        return certify(self.placed(t), path, margin)
+
+    def _opening(self, t: int) -> float:
+        """The gripper's opening in [0, 1] as measured at waypoint `t`."""
+        return float(np.clip(self.demonstration.steps.measured_gripper[t], 0.0, 1.0))
+
+
+def make_world(
+    source: Source,
+    demonstration: Demonstration,
+    robot: RobotSpec,
+    scene: SceneSpec,
+    slip_tolerance: float = IN_GRASP_SLIP,
+    cloud: CloudConfig | None = None,
+) -> CollisionWorld:
+    """The obstacles of a demonstration from the scene's geometry, or from what cameras saw alone.
+
+    Args:
+        source: "scene": the bodies of `scene`, where the demonstration has them; "cloud": the
+            recorded RGB-D.
+        demonstration: what was shown.
+        robot: the robot that was steered.
+        scene: the task's scene; of "cloud", only what is fixed to the robot is looked at, and the
+            names of the bodies that can be lifted.
+        slip_tolerance: how far [m] a grasped object may move in the grasp.
+        cloud: how pictures become a cloud.
+
+    Raises:
+        UnknownName: no such source.
+        Mismatch: the demonstration is of another robot, or "scene": it doesn't tell where the
+            scene's bodies were.
+        InvalidInput: "scene": a body has no shape that collides.
+    """
+    # They are worlds of the class above.
+    from sart_toolkit.collision.cloud_world import CloudWorld
+    from sart_toolkit.collision.exact import ExactWorld
+
+    if source == "scene":
+        return ExactWorld(demonstration, robot, scene, slip_tolerance)
+    if source == "cloud":
+        return CloudWorld(demonstration, robot, scene, slip_tolerance, cloud)
+    raise unknown_name("source", source, SOURCES)

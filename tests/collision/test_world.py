@@ -1,0 +1,105 @@
+"""One interface to obstacles, whether they are known from a description or from pictures."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sart_toolkit.collision.certificate import certify
+from sart_toolkit.collision.cloud import CloudConfig
+from sart_toolkit.collision.cloud_world import CloudWorld
+from sart_toolkit.collision.exact import ExactWorld
+from sart_toolkit.collision.model import CLOUD
+from sart_toolkit.collision.world import SOURCES, make_world
+from sart_toolkit.errors import Mismatch, UnknownName
+from sart_toolkit.motion.path import PolylinePath
+from sart_toolkit.robots import get_robot
+
+
+@pytest.fixture(scope="module", params=SOURCES)
+def world(request, peg_demonstration, peg_model, peg_task):
+    return make_world(request.param, peg_demonstration, peg_model.spec, peg_task.scene)
+
+
+def descent(world, start, end):
+    return PolylinePath(world.demonstration.steps.joint_positions[start:end])
+
+
+def test_a_source_s_name_makes_its_world(peg_demonstration, peg_model, peg_task):
+    about = peg_demonstration, peg_model.spec, peg_task.scene
+    for source, kind in (("scene", ExactWorld), ("cloud", CloudWorld)):
+        world = make_world(source, *about, slip_tolerance=0.001)
+        assert type(world) is kind
+        assert world.slip_tolerance == 0.001
+        assert world.demonstration is peg_demonstration
+        assert world.kinematics.spec is peg_model.spec
+        assert len(world.phases) == len(peg_demonstration)
+    thick = make_world("cloud", *about, cloud=CloudConfig(inflation=0.01))
+    thin = make_world("cloud", *about)
+    q = peg_demonstration.steps.joint_positions[0]
+    apart = [w.placed(0).tool_clearances(q)[0].distance for w in (thick, thin)]
+    assert apart[1] - apart[0] == pytest.approx(0.01 - CloudConfig().inflation, abs=2e-6)
+
+
+def test_the_way_down_to_the_hole_is_proved_free_and_into_the_table_is_not(world):
+    way_down = descent(world, 0, 20)
+    certificate = world.certify(0, way_down, 0.001)
+    assert certificate.verdict == "free" and certificate.margin == 0.001
+    assert certificate == certify(world.placed(0), way_down, 0.001)
+    q = world.demonstration.steps.joint_positions[0]
+    model = world.kinematics
+    T = model.fk(q)
+    T[2, 3] -= 0.2
+    down = PolylinePath([q, model.ik(T, q)])
+    assert world.certify(0, down).verdict == "collision"
+
+
+def test_a_pair_that_is_too_close_is_told_by_its_names(world):
+    q = world.demonstration.steps.joint_positions[0]
+    apart = world.placed(0).nearest(q)
+    assert world.too_close(0, q, apart.distance - 1e-5) is None
+    assert world.too_close(0, q, apart.distance + 1e-5) == " / ".join(apart.pair)
+
+
+def test_only_what_is_known_to_move_is_told_to(picked, first_grasp, toolbox):
+    shown, robot = picked.demonstration, get_robot(toolbox.robot)
+    assert picked.moving(0) is None and picked.moving(first_grasp + 5) is None
+    # Carried away without being in the grasp, that is.
+    told = ExactWorld(dataclasses.replace(shown, touching=((),) * len(shown)), robot, toolbox.scene)
+    assert told.moving(first_grasp + 10) == "toolbox"
+    seen = CloudWorld(shown, robot, toolbox.scene)
+    assert all(seen.moving(t) is None for t in range(len(shown)))
+
+
+def test_nothing_of_the_scene_but_what_was_seen_enters_a_cloud_s_certificate(
+    peg_demonstration, peg_model, peg_task
+):
+    path = PolylinePath(peg_demonstration.steps.joint_positions[:20])
+    blind = dataclasses.replace(peg_demonstration, body_Ts_world={})
+    bare = dataclasses.replace(peg_task.scene, bodies=())
+    known = CloudWorld(peg_demonstration, peg_model.spec, peg_task.scene)
+    unknown = CloudWorld(blind, peg_model.spec, bare)
+    names = {body.name for body in peg_task.scene.bodies}
+    placed = unknown.placed(0)
+    assert CLOUD in {placed.names(k)[1] for k in range(len(placed.pairs))}
+    assert names.isdisjoint(name for k in range(len(placed.pairs)) for name in placed.names(k))
+    assert unknown.certify(0, path) == known.certify(0, path)
+
+
+def test_the_same_waypoint_is_put_together_once(world):
+    assert world.placed(3) is world.placed(3)
+    np.testing.assert_array_equal(world.placed(3).pairs, world.placed(4).pairs)
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_a_demonstration_of_another_robot_is_refused(
+    source, peg_demonstration, peg_model, peg_task
+):
+    stranger = dataclasses.replace(peg_demonstration, robot="ur3")
+    with pytest.raises(Mismatch, match="the demonstration is of robot 'ur3', not "):
+        make_world(source, stranger, peg_model.spec, peg_task.scene)
+
+
+def test_another_source_is_refused(peg_demonstration, peg_model, peg_task):
+    with pytest.raises(UnknownName, match="unknown source 'clouds': did you mean 'cloud'"):
+        make_world("clouds", peg_demonstration, peg_model.spec, peg_task.scene)
