@@ -24,8 +24,8 @@ class AugmentConfig:
     `quotas`, their weights being their radii, or with `share` "equal" all the same, as in the
     paper. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
     proved to keep `margin` [m] free, even if what is carried moves by `grasp_play` [m] in the
-    grasp; if any point of it moves farther the segment is rejected. `camera`: whose pictures are
-    recorded, `None` for none.
+    grasp; if any point of it moves farther the segment is rejected. `cameras`: whose pictures are
+    recorded; `None` for those of the demonstration.
     """
 
     n: int = 40
@@ -36,7 +36,7 @@ class AugmentConfig:
     margin: float = 0.0002
     grasp_play: float = GRASP_PLAY
     seed: int = 0
-    camera: str | None = "wrist"
+    cameras: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.n < 2:
@@ -51,6 +51,8 @@ class AugmentConfig:
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidInput(f"{name}: expected a finite number >= 0 m, got {value}")
         get_strategy(self.strategy)
+        if self.cameras is not None:
+            object.__setattr__(self, "cameras", tuple(self.cameras))
 
     def quotas(self, radii: Sequence[float]) -> list[int]:
         """How many of the n - 1 trajectories spheres of the given radii [m] get.

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.executors import KEPT, SegmentMaker
+from sart_toolkit.augment.executors import KEPT, SegmentMaker, check_executes
 from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.data.records import (
     Annotation,
@@ -43,9 +43,7 @@ from sart_toolkit.errors import (
     BrokenFile,
     InvalidInput,
     Mismatch,
-    MissingCapability,
     OutputExists,
-    unknown_name,
 )
 from sart_toolkit.workers import worker_map
 
@@ -107,8 +105,9 @@ def augment_demonstration(
         progress: called with (kept, wanted, rejected) after each try.
 
     Raises:
-        Mismatch: the annotation belongs to another demonstration.
-        MissingCapability: the backend can't restore states or render.
+        Mismatch: the annotation belongs to another demonstration, or the backend has other rates.
+        MissingCapability: the backend can't restore states or take the pictures.
+        UnknownName: it has no such camera.
         OutputExists: `out` holds something else and `overwrite` is false.
         CannotWrite: the disk refuses.
         InvalidInput: no try from any sphere was kept, or `workers` is not positive.
@@ -129,7 +128,8 @@ def augment_demonstration(
     # All that can be refused is refused before anything is replaced.
     if workers < 1:
         raise InvalidInput(f"workers: expected at least 1, got {workers}")
-    _check_capable(make_backend, config.camera)
+    with closing(make_backend()) as backend:
+        check_executes(backend, demonstration, config)
     finished = _prepare(out, request, demonstration, annotation, overwrite)
     if finished is not None:
         return finished
@@ -202,18 +202,6 @@ def _next_batch(outcomes: dict[tuple[int, int], str], quotas: list[int]) -> list
         missing = [k for k in range(limit) if k not in tried]
         batch += [(sphere, k) for k in missing[: quota - kept]]
     return sorted(batch, key=lambda at: (at[1], at[0]))
-
-
-def _check_capable(make_backend: BackendFactory, camera: str | None) -> None:
-    with closing(make_backend()) as backend:
-        can = backend.capabilities
-        if camera is not None and camera not in backend.cameras:
-            raise unknown_name("camera", camera, backend.cameras)
-        if not (can.can_restore and (camera is None or can.renders)):
-            raise MissingCapability(
-                f"backend {backend.name!r} can't restore states and render, which augmentation "
-                "needs; use another backend"
-            )
 
 
 def _finish(

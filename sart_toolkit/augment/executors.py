@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,17 +10,17 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner, path_deviation
-from sart_toolkit.backends.interface import Backend, Observation
-from sart_toolkit.collision.certificate import Certificate, certify
-from sart_toolkit.data.records import (
-    CONTROL_HZ,
-    CONTROL_PER_RECORD,
-    Annotation,
-    Demonstration,
-    Episode,
-    Provenance,
+from sart_toolkit.backends.interface import (
+    Backend,
+    Contact,
+    Observation,
+    SavesStates,
+    SensesContacts,
+    require,
 )
-from sart_toolkit.errors import MotionRejected, Unreachable
+from sart_toolkit.collision.certificate import Certificate, certify
+from sart_toolkit.data.records import Annotation, Demonstration, Episode, Provenance
+from sart_toolkit.errors import Mismatch, MotionRejected, Unreachable
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.motion.timing import Motion
@@ -30,6 +31,7 @@ from sart_toolkit.scenes.spec import SceneSpec
 KEPT = "kept"
 # By no more than this [m] may any point of a body be moved that isn't carried.
 _MOVED = 0.001
+_FROM_STATES = "segments start from the demonstration's saved states"
 
 
 @dataclass(frozen=True)
@@ -57,8 +59,12 @@ class SegmentMaker:
         """Make tries on `backend`, the robot in the demonstration's scene.
 
         Raises:
-            Mismatch: the demonstration doesn't tell where the scene's bodies were.
+            Mismatch: the demonstration doesn't tell where the scene's bodies were, or was recorded
+                at other rates.
+            MissingCapability: the backend can't restore states or take the pictures.
+            UnknownName: it has no such camera.
         """
+        self._cameras = check_executes(backend, demonstration, config)
         self._backend = backend
         self._demonstration, self._annotation = demonstration, annotation
         self._config = config
@@ -78,9 +84,6 @@ class SegmentMaker:
         Args:
             sphere: which sphere.
             k: which try; it alone decides the random numbers, with the seed and the sphere.
-
-        Raises:
-            MissingCapability: the backend can't restore states.
         """
         proposal, rng = self._planner.proposal(sphere, k)
         t_star = proposal.t_star
@@ -110,27 +113,30 @@ class SegmentMaker:
     def _execute(self, motion: Motion, t_star: int) -> tuple[StepRecorder, Array]:
         """The record of a motion's execution, and the joints `(m, n)` as measured on the way."""
         backend, steps = self._backend, self._demonstration.steps
+        rates = self._demonstration.rates
         gripper = float(steps.commanded_gripper[t_star])
         scene = self._planner.scene
         carried = scene.phases[t_star].carried
         controller = ToolController(scene.collision.kinematics)
-        backend.restore(self._demonstration.states[t_star])
+        states = require(backend, SavesStates, _FROM_STATES)
+        states.restore(self._demonstration.states[t_star])
         controller.reset(
             steps.commanded_joint_positions[t_star], steps.commanded_Ts_world_tool[t_star]
         )
-        cameras = () if self._config.camera is None else (self._config.camera,)
-        recorder = StepRecorder(backend, cameras)
+        recorder = StepRecorder(backend, scene.collision.kinematics, self._cameras)
         start = recorded = backend.observe()
         measured = [start.q[None]]
-        times = motion.times(CONTROL_HZ)
+        times = motion.times(rates.control_hz)
         for i, (time, q) in enumerate(zip(times, motion.joints(times), strict=True), 1):
             # As a policy will be at its own rate, held to what was measured a recorded step ago.
             controller.follow(q, motion.T_world_tool(time), recorded.T_world_tool)
-            backend.command(q, gripper)
+            sent = backend.command(q, gripper)
+            if not np.array_equal(sent.q, q) or sent.gripper != gripper:
+                raise MotionRejected("command cut short: the robot can't go so fast")
             backend.step()
-            if backend.capabilities.has_contacts:
-                check_untouched(backend, carried)
-            if i % CONTROL_PER_RECORD:
+            if isinstance(backend, SensesContacts):
+                check_untouched(backend.scene, backend.contacts(), carried)
+            if i % rates.control_per_record:
                 seen = backend.observe()
             else:
                 seen = recorded = recorder.add(controller, gripper, 0.0)
@@ -162,16 +168,39 @@ class SegmentMaker:
         }
 
 
-def check_untouched(backend: Backend, carried: frozenset[str]) -> None:
+def check_executes(
+    backend: Backend, demonstration: Demonstration, config: AugmentConfig
+) -> tuple[str, ...]:
+    """The cameras that segments are recorded with, if the backend can execute and record them.
+
+    Raises:
+        Mismatch: the demonstration was recorded at other rates.
+        MissingCapability: the backend can't restore states or take the pictures.
+        UnknownName: it has no such camera.
+    """
+    cameras = config.cameras
+    if cameras is None:
+        cameras = tuple(demonstration.steps.cameras)
+    backend.check_cameras(cameras)
+    require(backend, SavesStates, _FROM_STATES)
+    if backend.rates != demonstration.rates:
+        raise Mismatch(
+            f"rates: the demonstration was recorded with {demonstration.rates}, the backend has "
+            f"{backend.rates}; make it with the demonstration's"
+        )
+    return cameras
+
+
+def check_untouched(scene: SceneSpec, contacts: Sequence[Contact], carried: frozenset[str]) -> None:
     """Return if nothing touched during the last step that should not.
 
     Raises:
         MotionRejected: the robot touched itself, or it or what it carries touched something else.
     """
-    touching = [(contact.a, contact.b) for contact in backend.contacts()]
-    bodies = {body.name for body in backend.scene.bodies}
+    touching = [(contact.a, contact.b) for contact in contacts]
+    bodies = {body.name for body in scene.bodies}
     itself = [pair for pair in touching if bodies.isdisjoint(pair)]
-    hits = sorted([*itself, *backend.scene.outer_contacts(touching, carried)])
+    hits = sorted([*itself, *scene.outer_contacts(touching, carried)])
     if hits:
         raise MotionRejected(f"contact {hits[0][0]} / {hits[0][1]}: stopped there")
 

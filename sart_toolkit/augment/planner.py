@@ -60,19 +60,22 @@ class SegmentPlanner:
             MotionRejected: the motion can't be proved clear, or a joint forbids it.
         """
         config, t = self._config, proposal.t_star
-        steps = self.scene.demonstration.steps
+        demonstration = self.scene.demonstration
+        steps, record_hz = demonstration.steps, demonstration.rates.record_hz
         placed = self.scene.placed(t)
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
         T_goal = proposal.T_world_sampled
         try:
-            motion = straight_line(placed.kinematics, q, T, T_goal, config.duration)
+            motion = straight_line(
+                placed.kinematics, q, T, T_goal, config.duration, record_hz=record_hz
+            )
             certificate = certify(placed, motion.path, config.margin)
             certificate.check_free()
         except (Unreachable, MotionRejected):
             if not get_strategy(config.strategy).plans:
                 raise
             motion, certificate = plan_motion(
-                placed, q, T_goal, config.duration, config.margin, rng
+                placed, q, T_goal, config.duration, config.margin, rng, record_hz=record_hz
             )
         return motion, certificate
 

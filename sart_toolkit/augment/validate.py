@@ -14,7 +14,6 @@ from sart_toolkit.augment.planner import SegmentPlanner, path_deviation
 from sart_toolkit.collision.certificate import Certificate, certify
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.data.records import (
-    RECORD_HZ,
     Annotation,
     Dataset,
     Demonstration,
@@ -158,7 +157,7 @@ class _EpisodeCheck:
                 f"{p.certificate['deviation'] * 1e3:.3f} mm are stated"
             )
         self.largest_deviation = max(self.largest_deviation, deviation)
-        _check_reversal(episode, motion, placed)
+        _check_reversal(episode, motion, placed, self._demonstration.rates.record_hz)
         _check_actions(episode, self._demonstration)
 
     def _compare(self, stated: Mapping[str, Any], which: str, found: Certificate) -> None:
@@ -176,10 +175,10 @@ class _EpisodeCheck:
         self.least_clearance = min(self.least_clearance, found.clearance)
 
 
-def _check_reversal(episode: Episode, motion: Motion, placed: PlacedModel) -> None:
+def _check_reversal(episode: Episode, motion: Motion, placed: PlacedModel, record_hz: int) -> None:
     """Return if an episode commands a motion backwards, and measured its joint path backwards."""
     steps = episode.steps
-    times = motion.times(RECORD_HZ)
+    times = motion.times(record_hz)
     if len(times) != len(steps):
         raise MotionRejected(f"reversal: {len(steps)} steps, the motion has {len(times)}")
     outwards = steps.commanded_joint_positions[::-1]

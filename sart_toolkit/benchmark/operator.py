@@ -80,12 +80,12 @@ class _Operator:
         row = {"cell": name, "episode": episode, "placement": placement.to_json()}
         try:
             shown = _shown(cell.task, backend, model, placement, rng)
-            success = cell.task.achieved(shown.success)
+            success = cell.task.achieved(shown.success, shown.rates.record_hz)
             row |= {
                 "success": success,
                 "seconds": float(shown.timestamps[-1]),
                 "force": float(np.nanmax(shown.steps.contact_force)),
-                "reason": None if success else cell.task.shortfall(backend.observe()),
+                "reason": None if success else cell.task.failure_reason(backend.observe()),
             }
         except SartError as error:
             row |= {"success": False, "seconds": None, "force": None, "reason": str(error)}
@@ -205,15 +205,15 @@ def benchmark_replay(
             far, turn, compared = tracking_difference(
                 original, copy, backend.scene, backend.robot.gripper.finger_links
             )
-            reason = task.shortfall(backend.observe())
-        success = task.achieved(copy.success)
+            reason = task.failure_reason(backend.observe())
+        success = task.achieved(copy.success, copy.rates.record_hz)
         rows.append(
             {
                 "task": task.name,
                 "recorded_on": source.backend,
                 "replayed_on": target.backend,
                 "placement": placement.to_json(),
-                "recorded_success": task.achieved(original.success),
+                "recorded_success": task.achieved(original.success, original.rates.record_hz),
                 "replayed_success": success,
                 "reason": None if success else reason,
                 "tool_difference_mm": far * 1e3,

@@ -27,9 +27,10 @@ def recorded(cell: Cell, backend: Backend, seed: int) -> Demonstration:
     rng = np.random.default_rng([seed, 0])
     placement = task.sample_placement(rng)
     model = RobotModel(backend.robot, backend.scene.held)
-    operator = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
+    plan, hz = task.plan(task.initial_state(model, placement)), backend.rates.control_hz
+    operator = ScriptedOperator(plan, rng, control_hz=hz)
     shown = record_demonstration(backend, task, model, operator, placement, config=_BLIND)
-    if not task.achieved(shown.success):
+    if not task.achieved(shown.success, shown.rates.record_hz):
         raise Mismatch(f"{cell.name}: the demonstration did not reach the goal; try another --seed")
     return shown
 

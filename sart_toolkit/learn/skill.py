@@ -199,7 +199,7 @@ def save_skill(
         camera=result.config.camera,
         recorded_size=(camera.rgb.shape[1], camera.rgb.shape[2]),
         intrinsics=camera.intrinsics,
-        T_tool_camera=camera.T_tool_camera,
+        T_tool_camera=camera.T_frame_camera,
         demonstration_hash=demonstration.content_hash(),
         training=result.config,
     )

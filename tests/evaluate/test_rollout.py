@@ -97,7 +97,7 @@ def test_replaying_the_demonstration_elsewhere_fails_and_says_by_how_much(roll_o
     assert re.match(r"peg 4\d mm beside the hole's axis, tip", result.reason)
 
 
-def test_a_rollout_ends_at_the_horizon_with_the_shortfall(roll_out):
+def test_a_rollout_ends_at_the_horizon_with_the_failure_reason(roll_out):
     task = get_task("peg_in_hole")
     task.horizon = 1.2
     result = roll_out(Player(), task=task)

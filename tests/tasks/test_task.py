@@ -146,7 +146,7 @@ def test_at_the_start_there_is_room_for_a_sphere_that_covers_every_placement(tas
         assert nearest.distance > needed, nearest
         assert placed.distances(seen.q).min() > 0
         assert not task.success(seen)
-        assert task.shortfall(seen)
+        assert task.failure_reason(seen)
 
 
 def test_the_object_is_in_the_wrist_view_at_every_corner_of_its_range(task, model, backend):
