@@ -39,15 +39,15 @@ def test_joints_follow_at_the_commanded_speed(bench: Bench) -> None:
 
 def test_a_command_returns_what_was_sent(bench: Bench) -> None:
     """Where a robot goes no farther than it can in one step, it says so."""
+    last = np.eye(len(bench.ready))[-1]
     for offset in (0.01, 0.1):
-        before = bench.see().q
-        sent = bench.backend.command(bench.ready + offset, 0.6)
+        sent = bench.backend.command(bench.ready + offset * last, 0.6)
         assert 0.0 <= sent.gripper <= 1.0
         bench.wait(0.5)
         arrived = np.abs(bench.see().q - sent.q) < _REACHED
         if offset == 0.01:
             bench.relies_on(arrived.all(), "test_commanded_joints_are_reached")
-        assert arrived.all(), f"from {before} it said that it sent {sent.q}"
+        assert arrived.all()
 
 
 def test_joint_velocities_are_those_of_the_joints(bench: Bench) -> None:
