@@ -7,7 +7,7 @@ import pytest
 
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Observation
-from sart_toolkit.data.records import CONTROL_HZ, PHYSICS_HZ
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import MissingExtra, UnknownName
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.spec import SceneSpec
@@ -41,8 +41,8 @@ def test_the_joint_path_is_measured_at_each_physics_step(name):
         pytest.skip(str(error))
     bench.command(bench.ready + 0.5)
     seen = bench.see()
-    assert len(seen.joint_path) == PHYSICS_HZ // CONTROL_HZ
-    speeds = np.diff(seen.joint_path, axis=0) * PHYSICS_HZ
+    assert len(seen.joint_path) == DEFAULT_RATES.physics_per_control
+    speeds = np.diff(seen.joint_path, axis=0) * DEFAULT_RATES.physics_hz
     assert (np.diff(speeds[:, 0]) > 0.5).all()
     np.testing.assert_allclose(speeds[-1], seen.dq, rtol=0, atol=1e-3)
     bench.backend.close()

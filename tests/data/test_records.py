@@ -48,7 +48,8 @@ def make_camera(n, rng):
         rgb=rng.integers(0, 256, (n, 4, 6, 3), np.uint8),
         depth=rng.uniform(0, 2, (n, 4, 6)).astype(np.float32),
         intrinsics=np.diag([6.0, 6.0, 1.0]),
-        T_tool_camera=pose([0.05, 0, -0.1], [0.1, 0, 0]),
+        frame="tool",
+        T_frame_camera=pose([0.05, 0, -0.1], [0.1, 0, 0]),
     )
 
 
@@ -286,7 +287,7 @@ def test_a_key_pose_that_is_not_at_its_waypoint_is_a_mismatch(change):
         ({"rgb": np.zeros((2, 4, 6, 4), np.uint8)}, r"rgb: expected .* got uint8 \(2, 4, 6, 4\)"),
         ({"depth": np.zeros((2, 4, 5))}, r"depth: expected shape \(2, 4, 6\), got \(2, 4, 5\)"),
         ({"intrinsics": np.eye(2)}, r"intrinsics: expected shape \(3, 3\)"),
-        ({"T_tool_camera": np.zeros((4, 4))}, "T_tool_camera: not a rigid transform"),
+        ({"T_frame_camera": np.zeros((4, 4))}, "T_frame_camera: not a rigid transform"),
     ],
 )
 def test_a_camera_record_that_does_not_fit_is_refused(change, message):
@@ -426,7 +427,7 @@ def test_a_demonstrations_hash_follows_every_array_that_was_shown():
     camera = demonstration.steps.cameras["wrist"]
     for name in arrays_of(camera):
         changed = np.array(getattr(camera, name))
-        if name == "T_tool_camera":
+        if name == "T_frame_camera":
             changed[:3, :3] = exp_rotation(np.array([0.2, 0, 0]))
         else:
             changed.flat[-1] += 1

@@ -81,7 +81,8 @@ def make_steps(n, rng, cameras=("wrist",), bodies=0):
                 rgb=rng.integers(0, 256, (n, 6, 8, 3), np.uint8),
                 depth=rng.uniform(0, 2, (n, 6, 8)).astype(np.float32),
                 intrinsics=np.diag([6.0, 6.0, 1.0]),
-                T_tool_camera=pose([0.05, 0, -0.1], [0.1, 0, 0]),
+                frame="tool",
+                T_frame_camera=pose([0.05, 0, -0.1], [0.1, 0, 0]),
             )
             for name in cameras
         },

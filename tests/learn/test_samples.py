@@ -190,7 +190,7 @@ def test_an_episode_without_the_camera_is_refused(dataset):
         build_windows(_with_last(dataset, steps), "wrist", 16, 2)
 
 
-@pytest.mark.parametrize("field", ["intrinsics", "T_tool_camera", "size"])
+@pytest.mark.parametrize("field", ["intrinsics", "T_frame_camera", "size"])
 def test_an_episode_seen_by_another_camera_is_refused(dataset, field):
     steps = dataset.episodes[-1].steps
     camera = steps.cameras["wrist"]

@@ -39,7 +39,13 @@ def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
         ("KinematicBackend", {"SensesContacts", "pictures: it has no cameras"}),
         (
             "KinematicArm",
-            {"Resets", "SavesStates", "KnowsBodies", "SensesContacts", "pictures: it has no cameras"},
+            {
+                "Resets",
+                "SavesStates",
+                "KnowsBodies",
+                "SensesContacts",
+                "pictures: it has no cameras",
+            },
         ),
     ],
 )
