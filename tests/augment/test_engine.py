@@ -652,7 +652,7 @@ def test_an_unknown_camera_is_refused_with_the_nearest_name(annotate, augment, t
 
 @pytest.mark.parametrize("mistake", ["workers", "camera", "backend", "annotation"])
 def test_a_request_that_is_refused_replaces_nothing_even_if_it_may_overwrite(
-    annotate, peg_demonstration, make_peg_backend, peg_backend, interrupted, tmp_path, mistake
+    annotate, peg_demonstration, make_peg_backend, limited, interrupted, tmp_path, mistake
 ):
     out = shutil.copytree(interrupted, tmp_path / "d")
     annotation, make, config, workers = annotate((0, 0.05)), make_peg_backend, CROWDED, 1
@@ -663,7 +663,7 @@ def test_a_request_that_is_refused_replaces_nothing_even_if_it_may_overwrite(
     elif mistake == "backend":
 
         def make():
-            return Arm(peg_backend.robot, peg_backend.scene)
+            return limited(make_peg_backend())
     else:
         annotation = dataclasses.replace(annotation, demonstration_hash="0" * 64)
     with pytest.raises(SartError, match="workers|wirst|use another backend|another demonstration"):

@@ -11,6 +11,8 @@ from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import ROBOTS, get_robot
 from sart_toolkit.scenes.spec import SceneSpec
 
+NO_PICTURES = "pictures: it has no cameras"
+
 
 def _told(outcome):
     return "\n\n".join(f"{test}: {message}" for test, message in outcome.failed.items())
@@ -36,7 +38,7 @@ def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
 @pytest.mark.parametrize(
     ("name", "lacking"),
     [
-        ("KinematicBackend", {"SensesContacts", "pictures: it has no cameras"}),
+        ("KinematicBackend", {"SensesContacts", NO_PICTURES}),
         (
             "KinematicArm",
             {
