@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.backends.interface import Observation
+from sart_toolkit.backends.interface import (
+    Draws,
+    Observation,
+    Resets,
+    SavesStates,
+    missing_abilities,
+    require,
+)
 from sart_toolkit.data.records import DEFAULT_RATES
-from sart_toolkit.errors import MissingExtra, UnknownName
+from sart_toolkit.errors import MissingCapability, MissingExtra, UnknownName
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.spec import SceneSpec
 from sart_toolkit.testing.bench import find_backend, make_bench
@@ -90,3 +97,25 @@ def test_depth_is_that_of_a_ray_cast_to_a_fifth_of_a_millimetre(view, camera, si
     difference = (depth - expected)[seen]
     assert (np.abs(difference) < 2e-4).mean() > 0.7
     assert (difference > 2e-4).mean() < 0.02
+
+
+def test_an_ability_is_had_or_its_lack_is_told_with_the_purpose(limited):
+    backend = make_backend("pybullet", get_robot("ur5e_hande"), SceneSpec(()), 8)
+    assert require(backend, Resets, "tests reset it") is backend
+    core = limited(backend, Resets)
+    assert missing_abilities(core, [Resets, Draws, SavesStates]) == ["Draws", "SavesStates"]
+    message = "backend 'limited' lacks the ability Draws, but films are drawn; use another backend"
+    with pytest.raises(MissingCapability, match=message):
+        require(core, Draws, "films are drawn")
+    backend.close()
+
+
+def test_a_backend_without_pictures_still_tells_a_camera_that_is_not_there(limited):
+    backend = limited(make_backend("pybullet", get_robot("ur5e_hande"), SceneSpec(()), 8))
+    backend.no_pictures = "its lens is broken"
+    backend.check_cameras(())
+    with pytest.raises(UnknownName, match="unknown camera 'wirst': did you mean 'wrist'"):
+        backend.check_cameras(("wirst",))
+    with pytest.raises(MissingCapability, match="takes no pictures: its lens is broken; use an"):
+        backend.check_cameras(("wrist",))
+    backend.close()
