@@ -104,7 +104,7 @@ def test_a_person_s_word_is_not_asked_where_the_backend_tells(peg_backend, peg_t
     session = TeleopSession(peg_backend, peg_task, peg_model, config=BLIND)
     session.start()
     session.stop()
-    with pytest.raises(InvalidInput, match="say_reached: the backend itself tells whether"):
+    with pytest.raises(InvalidInput, match="say_reached: this backend tells by itself"):
         session.say_reached()
 
 
@@ -151,7 +151,7 @@ def test_what_a_robot_was_really_sent_is_what_is_recorded(
 
 @pytest.fixture(scope="module")
 def seen_twice(peg_task, peg_model, tmp_path_factory):
-    """A demonstration with rectangular pictures of the wrist camera and a fixed one, from a file."""
+    """A demonstration with rectangular pictures of wrist and overview, read from its file."""
     robot = get_robot(peg_task.robot)
     backend = make_backend("pybullet", robot, peg_task.scene, "64x48")
     config = SessionConfig(("wrist", "overview"))
