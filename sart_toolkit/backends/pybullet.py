@@ -269,7 +269,9 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
 
     def _frame_pose(self, frame: str) -> Array:
         """Where a frame of the robot, or "world", is."""
-        return np.eye(4) if frame == "world" else self._link_pose(self._robot, self._links[frame])
+        link = -1 if frame == "world" else self._links[frame]
+        # The robot's base stands at the world's origin.
+        return np.eye(4) if link < 0 else self._link_pose(self._robot, link)
 
     def _link_pose(self, index: int, link: int) -> Array:
         state = self._client.getLinkState(index, link, 0, 1)

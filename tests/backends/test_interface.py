@@ -89,7 +89,7 @@ def _ray_cast(bench, camera, size):
 @pytest.mark.parametrize("size", [33, 64, 128])
 @pytest.mark.parametrize("camera", ["left", "right"])
 def test_depth_is_that_of_a_ray_cast_to_a_fifth_of_a_millimetre(view, camera, size):
-    view.needs("renders")
+    view.needs_pictures()
     depth = view.see((camera,), size).cameras[camera].depth
     expected = _ray_cast(view, camera, size)
     # The robot hides some, and the balls are made of facets; at an edge a pixel may show either.
