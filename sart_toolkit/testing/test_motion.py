@@ -120,6 +120,8 @@ def test_the_tool_is_where_kinematics_have_it(bench: Bench) -> None:
 def test_what_is_held_moves_rigidly_with_the_robot(bench: Bench) -> None:
     """A scene's attachments stand where their frame has them."""
     bench.needs(KnowsBodies)
+    known = "test_the_bodies_observed_are_those_that_a_backend_knows"
+    bench.relies_on("stick" in bench.see().Ts_world_body, known)
     for offset in (0.0, 0.2):
         bench.reset(bench.ready + offset)
         bench.command(bench.q + 0.01)

@@ -570,11 +570,10 @@ class NoBodiesAfterAll(PyBulletBackend):
 
 
 class ForgetsWhatItHolds(PyBulletBackend):
-    """Tells where the scene's bodies are, not what the gripper holds."""
+    """Tells where the scene's bodies are, not where the stick in the gripper is."""
 
     def body_poses(self) -> dict[str, Array]:
-        held = {body.name for body in self.scene.held if body.name.startswith("speck")}
-        return {name: T for name, T in super().body_poses().items() if name not in held}
+        return {name: T for name, T in super().body_poses().items() if name != "stick"}
 
 
 class SilentlyWithoutPictures(PyBulletBackend):
