@@ -96,7 +96,7 @@ class SkillConfig:
 
 
 class Skill:
-    """A trained policy that remembers its own history: `reset()`, then `act(...)` at 10 Hz.
+    """A trained policy that remembers its own history: `reset()`, then `act(...)` at its rate.
 
     Attributes:
         config: what must be known to execute it elsewhere.
