@@ -55,9 +55,9 @@ class SegmentsConfig:
 class LimitCheck:
     """How a motion fares against the robot's limits, and what is commanded against its path.
 
-    `ratios`: the greatest joint velocity, acceleration and jerk over their limits, at each physics step;
-    `violations`: how many of these samples, joints counted singly, exceed theirs. `off` [m]: how
-    far the tool is at most from the path at what the backend commands at each physics step.
+    `ratios`: the greatest joint velocity, acceleration and jerk over their limits, at any physics
+    step; `violations`: how many of these samples, joints counted singly, exceed theirs. `off` [m]:
+    how far the tool is at most from the path at what the backend commands at each physics step.
     """
 
     ratios: tuple[float, float, float]

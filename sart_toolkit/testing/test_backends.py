@@ -37,9 +37,9 @@ def test_name_and_abilities_are_known_before_connecting(target: tuple[str, str])
 def test_rates_are_those_asked_for(bench: Bench) -> None:
     """A backend is made for rates, and keeps to them."""
     rates = Rates(physics_hz=180, control_hz=60, record_hz=15)
-    before = bench.see().time
+    start = bench.see().time
     bench.wait(1 / bench.hz)
-    right = bench.see().time - before == pytest.approx(1 / bench.hz, abs=1e-9)
+    right = bench.see().time - start == pytest.approx(1 / bench.hz, abs=1e-9)
     bench.relies_on(right, "test_a_step_advances_time_by_one_control_period")
     made = find_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16, rates)
     assert made.rates == rates
