@@ -6,6 +6,8 @@ import functools
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +16,11 @@ from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import make_backend
-from sart_toolkit.backends.interface import Backend
+from sart_toolkit.backends.interface import Backend, CommandSent, KnowsBodies, Observation
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.poses import Array
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
@@ -61,6 +64,41 @@ def wait_until() -> Callable[..., None]:
             time.sleep(0.05)
 
     return wait
+
+
+class _Limited(Backend):
+    """The core of another backend."""
+
+    def __init__(self, inner: Backend) -> None:
+        super().__init__(inner.robot, inner.scene, inner.image_size, inner.rates)
+        self.name, self.inner = "limited", inner
+
+    def observe(self, *args: Any) -> Observation:
+        seen = self.inner.observe(*args)
+        return seen if isinstance(self, KnowsBodies) else replace(seen, Ts_world_body={})
+
+    def command(self, q: Array, gripper: float) -> CommandSent:
+        return self.inner.command(q, gripper)
+
+    def step(self) -> None:
+        self.inner.step()
+
+    def close(self) -> None:
+        self.inner.close()
+
+
+@pytest.fixture(scope="session")
+def limited() -> Callable[..., Backend]:
+    """Makes a backend of another with only those abilities that are named."""
+
+    def limit(inner: Backend, *abilities: type) -> Backend:
+        def passed_on(name: str) -> Callable[..., Any]:
+            return lambda self, *args: getattr(self.inner, name)(*args)
+
+        names = {name for ability in abilities for name in ability.__abstractmethods__}
+        return type("Limited", (_Limited, *abilities), {n: passed_on(n) for n in names})(inner)
+
+    return limit
 
 
 @pytest.fixture(scope="session")

@@ -32,14 +32,13 @@ from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.backends.interface import Backend, BackendFactory
+from sart_toolkit.backends.interface import Backend, BackendFactory, Resets, require
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.cloud import fuse_cloud
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
-    CONTROL_HZ,
     Annotation,
     CameraRecord,
     Demonstration,
@@ -231,7 +230,8 @@ def _synthetic_dataset(path: Path, n_episodes: int, flat: bool = False) -> Datas
             rgb=pictures(n),
             depth=np.zeros((n, 128, 128), np.float32),
             intrinsics=np.diag([128.0, 128.0, 1.0]),
-            T_tool_camera=np.eye(4),
+            frame="tool",
+            T_frame_camera=np.eye(4),
         )
         joints = np.zeros((n, 6))
         gripper = rng.uniform(0, 1, n)
@@ -792,7 +792,7 @@ def _drive(backend: Backend, task: Task, seed: int) -> tuple[float, float]:
     state = task.initial_state(model, Placement())
     operator = ScriptedOperator(task.plan(state), np.random.default_rng(seed))
     controller = ToolController(model)
-    backend.reset(state)
+    require(backend, Resets, "each demonstration begins at the task's start").reset(state)
     controller.reset(state.q)
     picture, physics = [], []
     while True:
@@ -802,7 +802,9 @@ def _drive(backend: Backend, task: Task, seed: int) -> tuple[float, float]:
         command = operator.read(seen)
         if command.stop:
             return statistics.mean(picture), statistics.mean(physics)
-        desired = apply_motion(controller.commanded_T_world_tool, command.velocity / CONTROL_HZ)
+        desired = apply_motion(
+            controller.commanded_T_world_tool, command.velocity / backend.rates.control_hz
+        )
         q = controller.move(desired, seen.T_world_tool, 1)[0]
         started = time.perf_counter()
         backend.command(q, command.gripper)

@@ -130,7 +130,7 @@ def _draw_picture(out: Path, draws: int) -> dict[str, Any]:
         name: SegmentPlanner(
             world,
             annotation,
-            AugmentConfig(strategy=name, sampling=SamplingConfig("area"), camera=None),
+            AugmentConfig(strategy=name, sampling=SamplingConfig("area"), cameras=()),
         )
         for name in ("sart", "sart_planned")
     }

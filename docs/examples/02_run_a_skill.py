@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import sart_toolkit as sart
+from sart_toolkit.backends.interface import Observation
 from sart_toolkit.evaluate.rollout import run_rollout
 
 
@@ -18,10 +19,11 @@ def main(directory: Path) -> None:
     backend = sart.make_backend("pybullet", sart.get_robot(skill.config.robot), task.scene)
     placement = task.sample_placement(np.random.default_rng(7))
     model = sart.RobotModel(backend.robot, task.scene.held)
+    hz = skill.demonstration.rates.record_hz
 
-    def watch(picture: np.ndarray, step: int, success: bool) -> None:
+    def watch(seen: Observation, step: int, success: bool) -> None:
         if success or step % 10 == 0:
-            print(f"{step / 10:4.1f} s  {'goal reached' if success else 'under way'}")
+            print(f"{step / hz:4.1f} s  {'goal reached' if success else 'under way'}")
 
     rollout = run_rollout(skill, task, backend, model, placement, watch=watch)
     print("succeeded" if rollout.success else f"failed: {rollout.reason}")

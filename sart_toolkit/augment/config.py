@@ -28,8 +28,8 @@ class AugmentConfig:
     paper. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
     proved to keep `margin` [m] free of the `obstacles`, the bodies of the scene or the cloud that
     the demonstration's cameras saw, even if what is grasped slips by `slip_tolerance` [m]; if any
-    point of it moves farther in the grasp the segment is rejected. `camera`: whose pictures are
-    recorded, `None` for none. `executor`: how segments are carried out.
+    point of it moves farther in the grasp the segment is rejected. `cameras`: whose pictures are
+    recorded, `None` for those of the demonstration. `executor`: how segments are carried out.
     """
 
     n: int = 40
@@ -41,7 +41,7 @@ class AugmentConfig:
     slip_tolerance: float = IN_GRASP_SLIP
     obstacles: Source = "scene"
     seed: int = 0
-    camera: str | None = "wrist"
+    cameras: tuple[str, ...] | None = None
     executor: str = "restore"
 
     def __post_init__(self) -> None:
@@ -59,6 +59,8 @@ class AugmentConfig:
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidInput(f"{name}: expected a finite number >= 0 m, got {value}")
         get_strategy(self.strategy)
+        if self.cameras is not None:
+            object.__setattr__(self, "cameras", tuple(self.cameras))
 
     def to_json(self) -> dict[str, Any]:
         """The settings as JSON values.

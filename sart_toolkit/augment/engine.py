@@ -104,8 +104,8 @@ def augment_sources(
 
     Raises:
         Mismatch: an annotation belongs to another demonstration, the demonstrations to different
-            tasks or robots, or one holds no saved states.
-        MissingCapability: the backend can't do what the executor needs, or can't render.
+            tasks or robots, one holds no saved states, or the backend has other rates.
+        MissingCapability: the backend can't do what the executor needs, or take the pictures.
         UnknownName: no such executor or camera.
         OutputExists: `out` holds something else and `overwrite` is false.
         CannotWrite: the disk refuses, or another process is at work on `out`.

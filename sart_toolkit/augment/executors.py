@@ -12,24 +12,18 @@ import numpy as np
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner, path_deviation, world_of
 from sart_toolkit.augment.strategies import strategy_name
-from sart_toolkit.backends.interface import Backend, Observation
+from sart_toolkit.backends.interface import (
+    Backend,
+    Contact,
+    Observation,
+    SavesStates,
+    SensesContacts,
+    require,
+)
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.data.manifest import KEPT, AttemptKey
-from sart_toolkit.data.records import (
-    CONTROL_HZ,
-    CONTROL_PER_RECORD,
-    Annotation,
-    Demonstration,
-    Episode,
-    Provenance,
-)
-from sart_toolkit.errors import (
-    Mismatch,
-    MissingCapability,
-    MotionRejected,
-    Unreachable,
-    unknown_name,
-)
+from sart_toolkit.data.records import Annotation, Demonstration, Episode, Provenance
+from sart_toolkit.errors import Mismatch, MotionRejected, Unreachable
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.motion.timing import Motion
@@ -40,6 +34,7 @@ from sart_toolkit.scenes.spec import SceneSpec
 
 # By no more than this [m] may any point of a body be moved that isn't grasped.
 _MOVED = 0.001
+_FROM_STATES = "segments start from the demonstration's saved states"
 
 
 @dataclass(frozen=True)
@@ -83,17 +78,16 @@ class SegmentExecutor(abc.ABC):
 
         Raises:
             UnknownName: the backend has no such camera.
-            MissingCapability: pictures are wanted and the backend can't render.
+            MissingCapability: pictures are wanted and the backend takes none.
+            Mismatch: a demonstration was recorded at other rates.
         """
-        if config.camera is None:
-            return
-        if config.camera not in backend.cameras:
-            raise unknown_name("camera", config.camera, backend.cameras)
-        if not backend.capabilities.renders:
-            raise MissingCapability(
-                f"backend {backend.name!r} can't render; augment without pictures, or use another "
-                "backend"
-            )
+        for demonstration in demonstrations:
+            backend.check_cameras(recorded_cameras(demonstration, config))
+            if backend.rates != demonstration.rates:
+                raise Mismatch(
+                    f"rates: the demonstration was recorded with {demonstration.rates}, the "
+                    f"backend has {backend.rates}; make it with the demonstration's"
+                )
 
     @abc.abstractmethod
     def attempts(self, keys: Iterable[AttemptKey]) -> Iterator[Attempt]:
@@ -132,15 +126,11 @@ class RestoreExecutor(SegmentExecutor):
 
         Raises:
             UnknownName: the backend has no such camera.
-            MissingCapability: the backend can't restore states, or pictures are wanted and it can't
-                render.
-            Mismatch: a demonstration holds no saved states.
+            MissingCapability: the backend can't restore states, or pictures are wanted and it
+                takes none.
+            Mismatch: a demonstration holds no saved states, or was recorded at other rates.
         """
-        if not backend.capabilities.can_restore:
-            raise MissingCapability(
-                f"backend {backend.name!r} can't restore states, which executor 'restore' needs; "
-                "use another backend"
-            )
+        require(backend, SavesStates, _FROM_STATES)
         super().check(backend, demonstrations, config)
         if not all(demonstration.states for demonstration in demonstrations):
             raise Mismatch(
@@ -189,28 +179,30 @@ class RestoreExecutor(SegmentExecutor):
         self, planner: SegmentPlanner, motion: Motion, demonstration: Demonstration, t_star: int
     ) -> tuple[StepRecorder, Array]:
         """The record of a motion's execution, and the joints `(m, n)` as measured on the way."""
-        backend, steps = self._backend, demonstration.steps
+        backend, steps, rates = self._backend, demonstration.steps, demonstration.rates
         gripper = float(steps.commanded_gripper[t_star])
         world = planner.world
         grasped = world.phases[t_star].grasped
         controller = ToolController(world.kinematics)
-        backend.restore(demonstration.states[t_star])
+        require(backend, SavesStates, _FROM_STATES).restore(demonstration.states[t_star])
         controller.reset(
             steps.commanded_joint_positions[t_star], steps.commanded_Ts_world_tool[t_star]
         )
-        cameras = () if self._config.camera is None else (self._config.camera,)
-        recorder = StepRecorder(backend, cameras)
+        cameras = recorded_cameras(demonstration, self._config)
+        recorder = StepRecorder(backend, world.kinematics, cameras)
         start = recorded = backend.observe()
         measured = [start.q[None]]
-        times = motion.times(CONTROL_HZ)
+        times = motion.times(rates.control_hz)
         for i, (time, q) in enumerate(zip(times, motion.joints(times), strict=True), 1):
             # As a policy will be at its own rate, held to what was measured a recorded step ago.
             controller.follow(q, motion.T_world_tool(time), recorded.T_world_tool)
-            backend.command(q, gripper)
+            sent = backend.command(q, gripper)
+            if not np.array_equal(sent.q, q) or sent.gripper != gripper:
+                raise MotionRejected("command cut short: the robot can't go so fast")
             backend.step()
-            if backend.capabilities.has_contacts:
-                check_untouched(backend, grasped)
-            if i % CONTROL_PER_RECORD:
+            if isinstance(backend, SensesContacts):
+                check_untouched(backend.scene, backend.contacts(), grasped)
+            if i % rates.control_per_record:
                 seen = backend.observe()
             else:
                 seen = recorded = recorder.add(controller, gripper, 0.0)
@@ -259,16 +251,21 @@ def get_executor(name: str) -> type[SegmentExecutor]:
     return found
 
 
-def check_untouched(backend: Backend, carried: frozenset[str]) -> None:
+def recorded_cameras(demonstration: Demonstration, config: AugmentConfig) -> tuple[str, ...]:
+    """The cameras that segments of a demonstration are recorded with."""
+    return tuple(demonstration.steps.cameras) if config.cameras is None else config.cameras
+
+
+def check_untouched(scene: SceneSpec, contacts: Sequence[Contact], grasped: frozenset[str]) -> None:
     """Return if nothing touched during the last step that should not.
 
     Raises:
         MotionRejected: the robot touched itself, or it or what it carries touched something else.
     """
-    touching = [(contact.a, contact.b) for contact in backend.contacts()]
-    bodies = {body.name for body in backend.scene.bodies}
+    touching = [(contact.a, contact.b) for contact in contacts]
+    bodies = {body.name for body in scene.bodies}
     itself = [pair for pair in touching if bodies.isdisjoint(pair)]
-    hits = sorted([*itself, *backend.scene.outer_contacts(touching, carried)])
+    hits = sorted([*itself, *scene.outer_contacts(touching, grasped)])
     if hits:
         raise MotionRejected(f"contact {hits[0][0]} / {hits[0][1]}: stopped there")
 

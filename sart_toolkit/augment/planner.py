@@ -58,19 +58,28 @@ class SegmentPlanner:
             MotionRejected: the motion can't be proved clear, or a joint forbids it.
         """
         config, t = self._config, proposal.t_star
-        steps = self.world.demonstration.steps
+        demonstration = self.world.demonstration
+        steps, record_hz = demonstration.steps, demonstration.rates.record_hz
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
         T_goal = proposal.T_world_sampled
         self.world.check_known(t)
         try:
-            motion = straight_line(self.world.kinematics, q, T, T_goal, config.duration)
+            motion = straight_line(
+                self.world.kinematics, q, T, T_goal, config.duration, record_hz=record_hz
+            )
             certificate = self.world.certify(t, motion.path, config.margin)
             certificate.check_free()
         except (Unreachable, MotionRejected):
             if not get_strategy(config.strategy).plans:
                 raise
             motion, certificate = plan_motion(
-                self.world.placed(t), q, T_goal, config.duration, config.margin, rng
+                self.world.placed(t),
+                q,
+                T_goal,
+                config.duration,
+                config.margin,
+                rng,
+                record_hz=record_hz,
             )
         return motion, certificate
 

@@ -16,7 +16,6 @@ from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.data.dataset import SUMMARY, Dataset, load_dataset
 from sart_toolkit.data.manifest import EpisodeEntry
 from sart_toolkit.data.records import (
-    RECORD_HZ,
     Demonstration,
     Episode,
     apply_action,
@@ -143,8 +142,9 @@ class _EpisodeCheck:
                 f"{p.certificate['deviation'] * 1e3:.3f} mm are stated"
             )
         self.largest_deviation = max(self.largest_deviation, deviation)
-        _check_reversal(episode, motion, planner.world.kinematics)
-        _check_actions(episode, self._sources[p.source].demonstration)
+        demonstration = self._sources[p.source].demonstration
+        _check_reversal(episode, motion, planner.world.kinematics, demonstration.rates.record_hz)
+        _check_actions(episode, demonstration)
 
     def _compare(self, stated: Mapping[str, Any], which: str, found: Certificate) -> None:
         claim = Certificate.from_json(stated[which])
@@ -161,10 +161,10 @@ class _EpisodeCheck:
         self.least_clearance = min(self.least_clearance, found.clearance)
 
 
-def _check_reversal(episode: Episode, motion: Motion, model: RobotModel) -> None:
+def _check_reversal(episode: Episode, motion: Motion, model: RobotModel, record_hz: int) -> None:
     """Return if an episode commands a motion backwards, and measured its joint path backwards."""
     steps = episode.steps
-    times = motion.times(RECORD_HZ)
+    times = motion.times(record_hz)
     if len(times) != len(steps):
         raise MotionRejected(f"reversal: {len(steps)} steps, the motion has {len(times)}")
     outwards = steps.commanded_joint_positions[::-1]

@@ -1,34 +1,26 @@
-"""The interface between the toolkit and a simulator or robot."""
+"""The interface between the toolkit and a simulator or robot: a small core, and abilities.
+
+The core, `Backend`, is what a hardware arm has. All else is an ability: a class of one or two
+methods that a backend also inherits and that code asks for by type. `require` returns a backend
+that has one, or says which is missing and what for:
+
+    require(backend, Resets, "a rollout starts from the task's initial state").reset(state)
+"""
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
-from sart_toolkit.data.records import DepthImage, Image
-from sart_toolkit.errors import InvalidInput, MissingCapability, unknown_name
+from sart_toolkit.data.records import DEFAULT_RATES, DepthImage, Image, Rates
+from sart_toolkit.errors import MissingCapability, unknown_name
 from sart_toolkit.poses import Array
-from sart_toolkit.robots.spec import CameraSpec, RobotSpec
+from sart_toolkit.robots.spec import CameraSpec, ImageSize, RobotSpec, check_image_size
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
-
-
-@dataclass(frozen=True)
-class Capabilities:
-    """What a backend can do; asking for more raises `MissingCapability`, nothing is silent.
-
-    `drift` [m] and `drift_deg`: how far robot and resting bodies may be, a second after a restore,
-    from where they would have been without; 0 where it makes no difference at all.
-    """
-
-    can_restore: bool
-    has_contacts: bool
-    renders: bool
-    observes_bodies: bool
-    drift: float = 1e-3
-    drift_deg: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -47,8 +39,9 @@ class CameraView:
 class Observation:
     """What the robot measures now.
 
-    `q`, `dq (n,)` [rad, rad/s]; `gripper` in [0, 1]; `T_world_tool (4,4)`; `time` [s] since reset;
-    `cameras` holds the pictures asked for; `Ts_world_body` the simulated bodies, held ones too.
+    `q`, `dq (n,)` [rad, rad/s]; `gripper` in [0, 1]; `T_world_tool (4,4)`; `time` [s] since the
+    start or the last reset; `cameras` holds the pictures asked for; `Ts_world_body` where the
+    bodies are, held ones too, as `KnowsBodies.body_poses` has them (empty without that ability).
     `joint_path (m, n)` [rad]: where the joints were during the last control period, measured as
     often as the backend can (our simulators: after each physics step), oldest first, the last row
     being `q`; no rows after `reset` or `restore`, and where the backend doesn't measure it.
@@ -69,6 +62,14 @@ class Observation:
 
 
 @dataclass(frozen=True)
+class CommandSent:
+    """The joint targets `q (n,)` [rad] and the gripper target in [0, 1] that were really sent."""
+
+    q: Array
+    gripper: float
+
+
+@dataclass(frozen=True)
 class Contact:
     """Two bodies that touched during the last control period, at any of its physics steps.
 
@@ -82,45 +83,89 @@ class Contact:
     penetration: float
 
 
-def check_size(image_size: int) -> int:
-    """`image_size` if it is a picture's width and height [pixels].
-
-    Raises:
-        InvalidInput: it is not positive.
-    """
-    if image_size < 1:
-        raise InvalidInput(f"image_size: expected at least 1 pixel, got {image_size}")
-    return image_size
-
-
 class Backend(abc.ABC):
-    """A robot in its scene, stepped at 30 Hz: what every simulator and robot implements.
+    """A robot in its scene, moved one control period at a time: what every backend implements.
 
     Attributes:
         robot: the robot's specification.
         scene: what surrounds it.
         image_size: width and height of pictures [pixels].
-        capabilities: what it can do, readable before connecting.
+        rates: how often it is commanded, measured and recorded.
+        no_pictures: why `observe` takes no pictures (here); empty where it does.
     """
 
     name: str
-    capabilities: Capabilities
+    no_pictures: str = ""
 
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
+    def __init__(
+        self,
+        robot: RobotSpec,
+        scene: SceneSpec,
+        image_size: ImageSize = 128,
+        rates: Rates = DEFAULT_RATES,
+    ) -> None:
         self.robot = robot
         self.scene = scene
-        self.image_size = check_size(image_size)
+        self.image_size = check_image_size(image_size)
+        self.rates = rates
 
     @property
     def cameras(self) -> dict[str, CameraSpec]:
-        """The cameras by name: the robot's wrist camera and the scene's."""
-        return {c.name: c for c in (self.robot.wrist_camera, *self.scene.cameras)}
+        """The cameras by name: the robot's and the scene's."""
+        return {c.name: c for c in (*self.robot.cameras, *self.scene.cameras)}
 
-    def _check_cameras(self, names: Sequence[str]) -> None:
+    def check_cameras(self, names: Sequence[str]) -> None:
+        """Return if pictures of the named cameras can be taken.
+
+        Raises:
+            UnknownName: there is no such camera.
+            MissingCapability: this backend takes no pictures.
+        """
         known = self.cameras
         for name in names:
             if name not in known:
                 raise unknown_name("camera", name, known)
+        if names and self.no_pictures:
+            raise MissingCapability(
+                f"backend {self.name!r} takes no pictures: {self.no_pictures}; use another backend"
+            )
+
+    @abc.abstractmethod
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
+        """Measure joints, gripper and tool, with pictures of the named cameras.
+
+        Args:
+            cameras: names of the cameras whose pictures are wanted.
+            image_size: width and height of the pictures, where not the backend's own.
+
+        Raises:
+            UnknownName: no such camera.
+            MissingCapability: pictures are asked for where it takes none.
+        """
+
+    @abc.abstractmethod
+    def command(self, q: Array, gripper: float) -> CommandSent:
+        """Set joint targets `(n,)` [rad] and gripper target in [0, 1], reached over the next step.
+
+        Where the robot can't go so far in one step, less may be sent; what is returned is what was.
+
+        Raises:
+            InvalidInput: wrong shape, not finite, outside limits.
+        """
+
+    @abc.abstractmethod
+    def step(self) -> None:
+        """Advance, or wait for, one control period."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Free the simulator or connection; calling it again does nothing."""
+
+
+class Resets(abc.ABC):
+    """Can put robot and bodies into a state."""
 
     @abc.abstractmethod
     def reset(self, state: SceneState) -> None:
@@ -134,37 +179,21 @@ class Backend(abc.ABC):
             UnknownName: the state has a body that the scene hasn't, or lacks one.
         """
 
-    @abc.abstractmethod
-    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
-        """Measure joints, gripper, tool and bodies, with pictures of the named cameras.
 
-        Args:
-            cameras: names of the cameras whose pictures are wanted.
-            image_size: width and height of the pictures, where not the backend's own.
+class SavesStates(abc.ABC):
+    """Can return to where it was.
 
-        Raises:
-            UnknownName: no such camera.
-        """
+    Attributes:
+        drift, drift_deg: how far [m], [deg] robot and resting bodies may be, a second after a
+            restore, from where they would have been without; 0 where it makes no difference at all.
+    """
 
-    @abc.abstractmethod
-    def command(self, q: Array, gripper: float) -> None:
-        """Set joint targets `(n,)` [rad] and gripper target in [0, 1], reached over the next step.
-
-        Raises:
-            InvalidInput: wrong shape, not finite, outside limits.
-        """
-
-    @abc.abstractmethod
-    def step(self) -> None:
-        """Advance one control period, 1/30 s."""
+    drift: float = 1e-3
+    drift_deg: float = 0.2
 
     @abc.abstractmethod
     def save(self) -> bytes:
-        """The state as bytes that `restore` takes, in this process or another.
-
-        Raises:
-            MissingCapability: `can_restore` is false.
-        """
+        """The state as bytes that `restore` takes, in this process or another."""
 
     @abc.abstractmethod
     def restore(self, state: bytes) -> None:
@@ -172,8 +201,19 @@ class Backend(abc.ABC):
 
         Raises:
             BrokenFile: the bytes are damaged or of another robot or scene.
-            MissingCapability: `can_restore` is false.
         """
+
+
+class SensesForce(abc.ABC):
+    """Can feel how hard it is pressed."""
+
+    @abc.abstractmethod
+    def force(self) -> float:
+        """The greatest contact force [N] during the last `step`; 0 after `reset` or `restore`."""
+
+
+class SensesContacts(SensesForce):
+    """Can tell which bodies touch, and so how hard."""
 
     @abc.abstractmethod
     def contacts(self) -> list[Contact]:
@@ -182,17 +222,62 @@ class Backend(abc.ABC):
         Every pair with a robot link, a held body or a scene body that can move counts. Left out are
         pairs that never move, links of the robot that neighbour each other, and a body with a joint
         against the one that it moves on. None have touched after `reset` or `restore`.
-
-        Raises:
-            MissingCapability: `has_contacts` is false.
         """
 
-    @abc.abstractmethod
-    def close(self) -> None:
-        """Free the simulator or connection; calling it again does nothing."""
+    def force(self) -> float:
+        return max((contact.force for contact in self.contacts()), default=0.0)
 
-    def _lacks(self, what: str) -> MissingCapability:
-        return MissingCapability(f"backend {self.name!r} can't {what}; use another backend")
+
+class KnowsBodies(abc.ABC):
+    """Can tell where the bodies are: those of the scene and those that the robot holds."""
+
+    @abc.abstractmethod
+    def body_poses(self) -> dict[str, Array]:
+        """The poses `(4, 4)` of all bodies in the world now, by name.
+
+        `observe` gives the same as `Observation.Ts_world_body`, which is where to read them.
+        """
+
+
+class Draws(abc.ABC):
+    """Can draw robot and scene in any state."""
+
+    @abc.abstractmethod
+    def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
+        """A picture of a state by a camera, which need not be one of the backend's.
+
+        Nothing else changes: robot and bodies stay as they are.
+
+        Raises:
+            MissingCapability: nothing can be drawn on this machine.
+        """
+
+
+A = TypeVar("A")
+
+
+def require(backend: Backend, ability: type[A], purpose: str) -> A:
+    """The backend itself, as one that has an ability.
+
+    Args:
+        backend: any backend.
+        ability: one of the classes above.
+        purpose: what needs it, as a clause: "segments start from saved states".
+
+    Raises:
+        MissingCapability: it lacks the ability.
+    """
+    if not isinstance(backend, ability):
+        raise MissingCapability(
+            f"backend {backend.name!r} lacks the ability {ability.__name__}, but {purpose}; use "
+            "another backend"
+        )
+    return backend
+
+
+def missing_abilities(backend: Backend, abilities: Sequence[type[Any]]) -> list[str]:
+    """The names of those abilities that a backend lacks."""
+    return [ability.__name__ for ability in abilities if not isinstance(backend, ability)]
 
 
 # Makes a robot in its scene; picklable where it goes to other processes.

@@ -1,8 +1,9 @@
-"""PyBullet behind the `Backend` interface: physics at 240 Hz, pictures by its CPU renderer."""
+"""PyBullet behind the `Backend` interface, with all abilities; pictures by its CPU renderer."""
 
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import os
 import tempfile
 import xml.etree.ElementTree as ET
@@ -16,17 +17,27 @@ from scipy.spatial.transform import Rotation
 from sart_toolkit.backends.interface import (
     Backend,
     CameraView,
-    Capabilities,
+    CommandSent,
     Contact,
+    Draws,
+    KnowsBodies,
     Observation,
-    check_size,
+    Resets,
+    SavesStates,
+    SensesContacts,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
-from sart_toolkit.data.records import CONTROL_HZ, PHYSICS_HZ
+from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec, check_gripper
+from sart_toolkit.robots.spec import (
+    CameraSpec,
+    ImageSize,
+    RobotSpec,
+    check_gripper,
+    check_image_size,
+)
 from sart_toolkit.robots.urdf import add_joint, rigid_link
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 
@@ -53,40 +64,39 @@ with _without_greetings():
     import pybullet as p
     from pybullet_utils.bullet_client import BulletClient
 
-_STEPS = PHYSICS_HZ // CONTROL_HZ
 # As a prism, which is what a cylinder becomes otherwise, it would be a millimetre larger.
 _URDF_FLAGS = p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_IMPLICIT_CYLINDER
 # OpenGL's camera looks along -z with y up; ours looks along z with y down.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-class PyBulletBackend(Backend):
+class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, Draws):
     """A robot in its scene in PyBullet, without a window.
 
-    Between two commands the joint targets move linearly at 240 Hz, so that the motion is as smooth
-    as an arm's own interpolator makes it. The gripper's linkage follows its driver through gear
-    constraints. Arm and tool may collide with each other; neighbouring links may not. The friction
-    between two bodies is the product of their coefficients.
+    Between two commands the joint targets move linearly with each physics step, so that the motion
+    is as smooth as an arm's own interpolator makes it. The gripper's linkage follows its driver
+    through gear constraints. Arm and tool may collide with each other; neighbouring links may not.
+    The friction between two bodies is the product of their coefficients.
     """
 
     name = "pybullet"
-    capabilities = Capabilities(
-        can_restore=True,
-        has_contacts=True,
-        renders=True,
-        observes_bodies=True,
-        drift=0.0,
-        drift_deg=0.0,
-    )
+    drift = 0.0
+    drift_deg = 0.0
 
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
+    def __init__(
+        self,
+        robot: RobotSpec,
+        scene: SceneSpec,
+        image_size: ImageSize = 128,
+        rates: Rates = DEFAULT_RATES,
+    ) -> None:
         """Load robot and scene; call `reset` before anything else."""
-        super().__init__(robot, scene, image_size)
+        super().__init__(robot, scene, image_size, rates)
         self._model = RobotModel(robot, scene.held)
         with _without_greetings():
             self._client: Any = BulletClient(p.DIRECT)
         c = self._client
-        c.setTimeStep(1.0 / PHYSICS_HZ)
+        c.setTimeStep(1.0 / rates.physics_hz)
         c.setGravity(*scene.gravity)
         c.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         self._load_robot()
@@ -111,6 +121,8 @@ class PyBulletBackend(Backend):
         self._scene_digest = scene_digest(self._model, scene)
         n = len(robot.arm_joints)
         self._target = self._last_target = np.zeros(n + 1)
+        # Another world with the same in it, where states are drawn.
+        self._stage: PyBulletBackend | None = None
         # The bytes restored last, until something changes: Bullet numbers contacts anew each time.
         self._restored: bytes | None = None
 
@@ -194,9 +206,19 @@ class PyBulletBackend(Backend):
     def reset(self, state: SceneState) -> None:
         q = self._model.check_limits(state.q)
         self.scene.check_state(state)
-        c = self._client
         self._forget_contacts()
-        for joint, angle in zip(self._arm, q, strict=True):
+        self._place(state)
+        self._target = self._last_target = np.append(q, state.commanded_gripper)
+        self._time = 0.0
+        self._touched = {}
+        # A restore from the file that this state saves to also drops what the solver remembers of
+        # earlier contacts, so that what follows depends on the state alone.
+        self._restored = None
+        self.restore(self.save())
+
+    def _place(self, state: SceneState) -> None:
+        c = self._client
+        for joint, angle in zip(self._arm, state.q, strict=True):
             c.resetJointState(self._robot, joint, angle)
         for name, position in self.robot.gripper.joint_positions(state.gripper).items():
             c.resetJointState(self._robot, self._gripper[name], position)
@@ -207,13 +229,6 @@ class PyBulletBackend(Backend):
             T = state.Ts_world_body[name] @ self._Ts_body_centre[index]
             c.resetBasePositionAndOrientation(index, T[:3, 3], _quaternion(T))
             c.resetBaseVelocity(index, [0, 0, 0], [0, 0, 0])
-        self._target = self._last_target = np.append(q, state.commanded_gripper)
-        self._time = 0.0
-        self._touched = {}
-        # A restore from the file that this state saves to also drops what the solver remembers of
-        # earlier contacts, so that what follows depends on the state alone.
-        self._restored = None
-        self.restore(self.save())
 
     def _forget_contacts(self) -> None:
         """Take all bodies apart: contacts that last keep the forces that they had."""
@@ -223,49 +238,62 @@ class PyBulletBackend(Backend):
                 c.resetBasePositionAndOrientation(index, [100.0 + 10.0 * i, 0, 0], [0, 0, 0, 1])
         c.performCollisionDetection()
 
-    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
         c = self._client
-        known = self.cameras
-        size = self.image_size if image_size is None else check_size(image_size)
-        self._check_cameras(cameras)
+        size = self.image_size if image_size is None else check_image_size(image_size)
+        self.check_cameras(cameras)
         states = c.getJointStates(self._robot, self._arm)
         closed = self.robot.gripper.closed_position
-        frames = {known[name].frame for name in cameras} - {"world"}
-        frames |= {self.robot.tool_frame, *(body.name for body in self.scene.held)}
-        Ts = {name: self._link_pose(self._robot, self._links[name]) for name in frames}
-        Ts_body = {body.name: Ts[body.name] for body in self.scene.held}
-        for name, (index, link) in self._bodies.items():
-            if link >= 0:
-                Ts_body[name] = self._link_pose(index, link)
-            else:
-                T_world_centre = _matrix(*c.getBasePositionAndOrientation(index))
-                Ts_body[name] = T_world_centre @ inverse(self._Ts_body_centre[index])
         return Observation(
             q=np.array([s[0] for s in states]),
             dq=np.array([s[1] for s in states]),
             gripper=c.getJointState(self._robot, self._driver)[0] / closed,
-            T_world_tool=Ts[self.robot.tool_frame],
+            T_world_tool=self._frame_pose(self.robot.tool_frame),
             time=self._time,
-            cameras={name: self._picture(name, Ts, size) for name in cameras},
-            Ts_world_body=Ts_body,
+            cameras={name: self._picture(self.cameras[name], *size) for name in cameras},
+            Ts_world_body=self.body_poses(),
             joint_path=np.array(self._joint_path),
         )
+
+    def body_poses(self) -> dict[str, Array]:
+        Ts = {body.name: self._frame_pose(body.name) for body in self.scene.held}
+        for name, (index, link) in self._bodies.items():
+            if link >= 0:
+                Ts[name] = self._link_pose(index, link)
+            else:
+                T_world_centre = _matrix(*self._client.getBasePositionAndOrientation(index))
+                Ts[name] = T_world_centre @ inverse(self._Ts_body_centre[index])
+        return Ts
+
+    def _frame_pose(self, frame: str) -> Array:
+        """Where a frame of the robot, or "world", is."""
+        link = -1 if frame == "world" else self._links[frame]
+        # The robot's base stands at the world's origin.
+        return np.eye(4) if link < 0 else self._link_pose(self._robot, link)
 
     def _link_pose(self, index: int, link: int) -> Array:
         state = self._client.getLinkState(index, link, 0, 1)
         return _matrix(state[4], state[5])
 
-    def _picture(self, name: str, Ts_world_frame: dict[str, Array], size: int) -> CameraView:
-        camera = self.cameras[name]
-        T = np.eye(4) if camera.frame == "world" else Ts_world_frame[camera.frame]
-        T_world_camera = T @ camera.T_frame_camera
+    def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
+        q = self._model.check_limits(state.q)
+        self.scene.check_state(state)
+        if self._stage is None:
+            self._stage = type(self)(self.robot, self.scene, rates=self.rates)
+        self._stage._place(dataclasses.replace(state, q=q))
+        return self._stage._picture(camera, *check_image_size((width, height)))
+
+    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        T_world_camera = self._frame_pose(camera.frame) @ camera.T_frame_camera
         near, far, light = camera.near, camera.far, self.scene.light
         view = inverse(T_world_camera @ _FLIP)
         _, _, rgb, buffer, _ = self._client.getCameraImage(
-            size,
-            size,
+            width,
+            height,
             view.T.ravel().tolist(),
-            _projection(camera.fov_y_deg, near, far, size),
+            _projection(camera.fov_y_deg, near, far, width, height),
             shadow=0,
             lightDirection=light.direction.tolist(),
             lightAmbientCoeff=light.ambient,
@@ -273,16 +301,18 @@ class PyBulletBackend(Backend):
             flags=p.ER_NO_SEGMENTATION_MASK,
             renderer=p.ER_TINY_RENDERER,
         )
-        rgb = np.asarray(rgb, np.uint8).reshape(size, size, 4)[:, :, :3]
-        z = np.asarray(buffer, np.float64).reshape(size, size)
+        rgb = np.asarray(rgb, np.uint8).reshape(height, width, 4)[:, :, :3]
+        z = np.asarray(buffer, np.float64).reshape(height, width)
         depth = near * far / (far - (far - near) * z)
         # What nothing was drawn over keeps the buffer's far plane, give or take a rounding.
         depth[depth >= far * (1 - 1e-4)] = 0.0
         return CameraView(np.ascontiguousarray(rgb), depth.astype(np.float32), T_world_camera)
 
-    def command(self, q: Array, gripper: float) -> None:
+    def command(self, q: Array, gripper: float) -> CommandSent:
+        sent = CommandSent(self._model.check_limits(q), check_gripper(gripper))
         self._restored = None
-        self._target = np.append(self._model.check_limits(q), check_gripper(gripper))
+        self._target = np.append(sent.q, sent.gripper)
+        return sent
 
     def step(self) -> None:
         c, robot = self._client, self._robot
@@ -292,8 +322,9 @@ class PyBulletBackend(Backend):
         self._touched = {}
         self._joint_path = []
         self._restored = None
-        for i in range(1, _STEPS + 1):
-            target = self._last_target + (i / _STEPS) * (self._target - self._last_target)
+        steps = self.rates.physics_per_control
+        for i in range(1, steps + 1):
+            target = self._last_target + (i / steps) * (self._target - self._last_target)
             # Position gain 1 closes the whole error within one physics step. A velocity target
             # beside it would put the arm one physics step ahead of its targets.
             c.setJointMotorControlArray(
@@ -312,7 +343,7 @@ class PyBulletBackend(Backend):
             self._joint_path.append([s[0] for s in c.getJointStates(robot, arm)])
             self._collect_contacts()
         self._last_target = self._target
-        self._time += 1.0 / CONTROL_HZ
+        self._time += 1.0 / self.rates.control_hz
 
     def _collect_contacts(self) -> None:
         forces: dict[tuple[str, str], float] = {}
@@ -377,6 +408,8 @@ class PyBulletBackend(Backend):
         self._restored = state
 
     def close(self) -> None:
+        if self._stage is not None:
+            self._stage.close()
         if self._client is not None:
             with suppress(p.error):
                 self._client.disconnect()
@@ -406,14 +439,14 @@ def _urdf_file(root: Body, moving: Iterable[Body]) -> Iterator[str]:
         os.unlink(path)
 
 
-def _projection(fov_y_deg: float, near: float, far: float, size: int) -> list[float]:
+def _projection(fov_y_deg: float, near: float, far: float, width: int, height: int) -> list[float]:
     """OpenGL's matrix, half a pixel off: TinyRenderer samples each pixel at its lower left corner.
 
     So (0, 0) of the picture is the centre of its first pixel, as `CameraSpec.intrinsics` says.
     """
-    matrix = list(p.computeProjectionMatrixFOV(fov_y_deg, 1.0, near, far))
-    matrix[8] += 1.0 / size
-    matrix[9] += 1.0 / size
+    matrix = list(p.computeProjectionMatrixFOV(fov_y_deg, width / height, near, far))
+    matrix[8] += 1.0 / width
+    matrix[9] += 1.0 / height
     return matrix
 
 

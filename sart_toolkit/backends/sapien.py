@@ -1,8 +1,7 @@
-"""SAPIEN behind the `Backend` interface: PhysX at 240 Hz, pictures with light and shadow."""
+"""SAPIEN behind the `Backend` interface, with all abilities: PhysX, light and shadow."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,10 +15,14 @@ from scipy.spatial.transform import Rotation
 from sart_toolkit.backends.interface import (
     Backend,
     CameraView,
-    Capabilities,
+    CommandSent,
     Contact,
+    Draws,
+    KnowsBodies,
     Observation,
-    check_size,
+    Resets,
+    SavesStates,
+    SensesContacts,
 )
 from sart_toolkit.backends.sapien_pictures import (
     ALONG_Z,
@@ -32,14 +35,21 @@ from sart_toolkit.backends.sapien_pictures import (
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
 from sart_toolkit.collision.model import primitive
-from sart_toolkit.data.records import CONTROL_HZ, PHYSICS_HZ
+from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import InvalidInput, MissingCapability, SartError
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec, Shape, check_gripper, mass_properties
+from sart_toolkit.robots.spec import (
+    CameraSpec,
+    ImageSize,
+    RobotSpec,
+    Shape,
+    check_gripper,
+    check_image_size,
+    mass_properties,
+)
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 
-_STEPS = PHYSICS_HZ // CONTROL_HZ
 # Solver iterations: fewer let fingers sink into what they squeeze.
 _ITERATIONS = 40
 # So stiff that a drive closes its whole error within one physics step, unless its force limit or
@@ -97,43 +107,42 @@ class _Moment:
         return _Moment(np.array(plain["q"]), np.array(plain["dq"]), *bodies)
 
 
-class SapienBackend(Backend):
+class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, Draws):
     """A robot in its scene in SAPIEN (PhysX 5 on the CPU), without a window.
 
-    Between two commands the joint targets move linearly at 240 Hz, so that the motion is as smooth
-    as an arm's own interpolator makes it. The gripper's linkage moves as one, give or take a
-    hundredth of its way, and its joints together bear the driver's force. Gravity doesn't act on
-    the robot. Arm and tool may collide with each other; neighbouring links may not. The friction
-    between two bodies is the mean of their coefficients.
+    Between two commands the joint targets move linearly with each physics step, so that the motion
+    is as smooth as an arm's own interpolator makes it. The gripper's linkage moves as one, give or
+    take a hundredth of its way, and its joints together bear the driver's force. Gravity doesn't
+    act on the robot. Arm and tool may collide with each other; neighbouring links may not. The
+    friction between two bodies is the mean of their coefficients.
 
     PhysX remembers contacts in ways that can't be saved. So every `reset` and `restore` builds the
     physics anew, and what follows depends on the state alone, to the bit; but the motion after a
-    `save` and the one after its `restore` may differ by `capabilities.drift`.
+    `save` and the one after its `restore` may differ by `drift`.
 
-    Physics needs no graphics. Where SAPIEN can't draw, `capabilities.renders` of the instance is
-    false, and asking for a picture says why.
+    Physics needs no graphics. Where SAPIEN can't draw, `no_pictures` of the instance says why, and
+    so does asking for a picture.
     """
 
     name = "sapien"
-    capabilities = Capabilities(
-        can_restore=True,
-        has_contacts=True,
-        renders=True,
-        observes_bodies=True,
-        drift=1e-3,
-        drift_deg=0.2,
-    )
+    drift = 1e-3
+    drift_deg = 0.2
 
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
+    def __init__(
+        self,
+        robot: RobotSpec,
+        scene: SceneSpec,
+        image_size: ImageSize = 128,
+        rates: Rates = DEFAULT_RATES,
+    ) -> None:
         """Load robot and scene; call `reset` before anything else.
 
         Raises:
             InvalidInput: the robot's URDF has joints or shapes that this backend doesn't know.
         """
-        super().__init__(robot, scene, image_size)
-        self._why_no_pictures = why_no_pictures()
-        if self._why_no_pictures:
-            self.capabilities = dataclasses.replace(self.capabilities, renders=False)
+        super().__init__(robot, scene, image_size, rates)
+        why = why_no_pictures()
+        self.no_pictures = f"SAPIEN can't draw here ({why}); {REMEDY}" if why else ""
         self._pictures: Pictures | None = None
         self._model = RobotModel(robot, scene.held)
         self._robot = _ConvexParts(robot, self._model)
@@ -170,7 +179,7 @@ class SapienBackend(Backend):
     def _start(self, moment: _Moment, target: Array) -> None:
         """Build the physics anew with everything as it is at a moment, and time 0."""
         self._now = moment
-        self._physics = _Physics(self._robot, self.scene, moment)
+        self._physics = _Physics(self._robot, self.scene, moment, self.rates.physics_hz)
         self._target = self._last_target = target
         self._periods = 0
         self._touched: dict[tuple[str, str], tuple[float, float]] = {}
@@ -181,54 +190,75 @@ class SapienBackend(Backend):
             raise SartError("backend 'sapien': was closed; make a new one")
         return self._physics
 
-    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
         self._running()
-        size = self.image_size if image_size is None else check_size(image_size)
-        self._check_cameras(cameras)
+        size = self.image_size if image_size is None else check_image_size(image_size)
+        self.check_cameras(cameras)
         now, robot = self._now, self._robot
-        robot.place(now.q)
-        Ts_body = {body.name: robot.frame_pose(body.name) for body in self.scene.held}
-        Ts_body |= {name: T.copy() for name, T in now.Ts_world_body.items()}
-        for name, body in self.scene.jointed.items():
-            assert body.joint is not None
-            T = Ts_body[body.joint.parent] @ body.joint.T_parent_moved(float(now.joints[name][0]))
-            Ts_body[name] = T
+        Ts_body = self.body_poses()
         return Observation(
             q=now.q[robot.arm],
             dq=now.dq[robot.arm],
             gripper=float(now.q[robot.driver]) / self.robot.gripper.closed_position,
             T_world_tool=robot.frame_pose(self.robot.tool_frame),
-            time=self._periods / CONTROL_HZ,
-            cameras=self._take(cameras, size, Ts_body) if cameras else {},
+            time=self._periods / self.rates.control_hz,
+            cameras=self._take([self.cameras[n] for n in cameras], size, Ts_body),
             Ts_world_body=Ts_body,
             joint_path=np.array(self._joint_path),
         )
 
+    def body_poses(self) -> dict[str, Array]:
+        self._running()
+        now, robot = self._now, self._robot
+        robot.place(now.q)
+        Ts = {body.name: robot.frame_pose(body.name) for body in self.scene.held}
+        Ts |= {name: T.copy() for name, T in now.Ts_world_body.items()}
+        for name, body in self.scene.jointed.items():
+            assert body.joint is not None
+            at = float(now.joints[name][0])
+            Ts[name] = Ts[body.joint.parent] @ body.joint.T_parent_moved(at)
+        return Ts
+
+    def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
+        self._running()
+        q = self._model.check_limits(state.q)
+        self.scene.check_state(state)
+        if self.no_pictures:
+            raise MissingCapability(self.no_pictures)
+        self._robot.place(self._robot.q_all(q, state.gripper))
+        size = check_image_size((width, height))
+        return self._take([camera], size, state.Ts_world_body)[camera.name]
+
     def _take(
-        self, names: Sequence[str], size: int, Ts_world_body: Mapping[str, Array]
+        self,
+        cameras: Sequence[CameraSpec],
+        size: tuple[int, int],
+        Ts_world_body: Mapping[str, Array],
     ) -> dict[str, CameraView]:
-        if self._why_no_pictures:
-            raise MissingCapability(f"SAPIEN can't draw here ({self._why_no_pictures}); {REMEDY}")
+        """Pictures of the robot as last placed, and of bodies at poses `(4, 4)`."""
+        if not cameras:
+            return {}
         robot = self._robot
         if self._pictures is None:
             self._pictures = Pictures(robot.geometry(pin.GeometryType.VISUAL), self.scene)
-        placed = {}
-        for name in names:
-            camera = self.cameras[name]
-            T = np.eye(4) if camera.frame == "world" else robot.frame_pose(camera.frame)
-            placed[name] = camera, T @ camera.T_frame_camera
+        placed = [(camera, robot.frame_pose(camera.frame)) for camera in cameras]
         return self._pictures.take(placed, size, robot.joint_poses(), Ts_world_body)
 
-    def command(self, q: Array, gripper: float) -> None:
+    def command(self, q: Array, gripper: float) -> CommandSent:
         self._running()
-        self._target = np.append(self._model.check_limits(q), check_gripper(gripper))
+        sent = CommandSent(self._model.check_limits(q), check_gripper(gripper))
+        self._target = np.append(sent.q, sent.gripper)
+        return sent
 
     def step(self) -> None:
         physics = self._running()
         self._touched = {}
         self._joint_path = []
-        for i in range(1, _STEPS + 1):
-            target = self._last_target + (i / _STEPS) * (self._target - self._last_target)
+        steps = self.rates.physics_per_control
+        for i in range(1, steps + 1):
+            target = self._last_target + (i / steps) * (self._target - self._last_target)
             physics.advance(target[:-1], self.robot.gripper.closed_position * float(target[-1]))
             self._joint_path.append(physics.arm_positions())
             for pair, (force, penetration) in physics.contacts().items():
@@ -328,7 +358,9 @@ class _ConvexParts:
         pin.framesForwardKinematics(self.model, self._data, q_all)
 
     def frame_pose(self, name: str) -> Array:
-        """The pose `(4, 4)` of a frame as last placed."""
+        """The pose `(4, 4)` of a frame, or of "world", as last placed."""
+        if name == "world":
+            return np.eye(4)
         return np.array(self._data.oMf[self._frames[name]].homogeneous)
 
     def joint_poses(self) -> dict[int, Array]:
@@ -346,10 +378,13 @@ class _ConvexParts:
 class _Physics:
     """Robot and bodies in PhysX, started at a moment."""
 
-    def __init__(self, robot: _ConvexParts, scene: SceneSpec, moment: _Moment) -> None:
+    def __init__(
+        self, robot: _ConvexParts, scene: SceneSpec, moment: _Moment, physics_hz: int
+    ) -> None:
+        self._hz = physics_hz
         with _scene_config(scene.gravity):
             self._system = sapien.physx.PhysxCpuSystem()
-        self._system.timestep = 1.0 / PHYSICS_HZ
+        self._system.timestep = 1.0 / physics_hz
         self._scene = sapien.Scene([self._system])
         # Names of shapes: links that are fixed to each other are one body to PhysX.
         self._names: dict[Any, str] = {}
@@ -405,7 +440,7 @@ class _Physics:
         for j, ratio in robot.linkage.items():
             self._weights[self._order.index(j - 1)] = ratio / squared
         self._lead = _LINKAGE_GIVE * gripper.closed_position
-        self._reach = max(gripper.speed / PHYSICS_HZ, self._lead)
+        self._reach = max(gripper.speed / self._hz, self._lead)
         for joint, _ in self._linkage:
             joint.set_drive_properties(gripper.force / (squared * self._lead), 0.0)
 
@@ -498,8 +533,8 @@ class _Physics:
         # joints say. So far ahead of that mean as they give under the gripper's force, the springs
         # act with that force; nor may s run ahead of the gripper's speed.
         s, speed = float(self._weights @ self._robot.qpos), float(self._weights @ self._robot.qvel)
-        ahead = min(max(speed, 0.0) / PHYSICS_HZ + self._lead, self._reach)
-        behind = min(max(-speed, 0.0) / PHYSICS_HZ + self._lead, self._reach)
+        ahead = min(max(speed, 0.0) / self._hz + self._lead, self._reach)
+        behind = min(max(-speed, 0.0) / self._hz + self._lead, self._reach)
         s = min(max(driver, s - behind), s + ahead)
         for joint, ratio in self._linkage:
             joint.set_drive_target(ratio * s)
@@ -517,7 +552,7 @@ class _Physics:
         """Force [N] and penetration [m] of each pair that touched in the last step."""
         found: dict[tuple[str, str], tuple[float, float]] = {}
         for contact in self._system.get_contacts():
-            force = PHYSICS_HZ * sum(math.hypot(*point.impulse) for point in contact.points)
+            force = self._hz * sum(math.hypot(*point.impulse) for point in contact.points)
             separation = min((point.separation for point in contact.points), default=math.inf)
             # PhysX also reports bodies that are only near each other.
             if separation > 0.0 and force <= 0.0:

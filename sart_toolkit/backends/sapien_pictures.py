@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -301,7 +301,7 @@ class Pictures:
         for drawn in (*self._joints.values(), *self._bodies.values()):
             drawn.join(self._scene)
         self._add_light(scene.light)
-        self._cameras: dict[tuple[str, int], Any] = {}
+        self._cameras: dict[tuple[Any, ...], Any] = {}
 
     def _add_light(self, light: Light) -> None:
         self._system.ambient_light = [light.ambient] * 3
@@ -320,15 +320,15 @@ class Pictures:
 
     def take(
         self,
-        cameras: Mapping[str, tuple[CameraSpec, Array]],
-        size: int,
+        cameras: Sequence[tuple[CameraSpec, Array]],
+        size: tuple[int, int],
         joints: Mapping[int, Array],
         bodies: Mapping[str, Array],
     ) -> dict[str, CameraView]:
         """The pictures of cameras, by name.
 
         Args:
-            cameras: each camera and its pose `(4, 4)` in the world.
+            cameras: each camera and the pose `(4, 4)` of its frame in the world.
             size: width and height [pixels].
             joints: pose `(4, 4)` of the robot's joint frames, by the index of their joint.
             bodies: pose `(4, 4)` of the scene's bodies.
@@ -337,19 +337,22 @@ class Pictures:
             drawn.move(joints[index])
         for name, drawn in self._bodies.items():
             drawn.move(bodies[name])
-        taken = {name: self._camera(camera, size) for name, (camera, _) in cameras.items()}
-        for name, (_, T) in cameras.items():
-            T_world_sapien = T.copy()
-            T_world_sapien[:3, :3] = T[:3, :3] @ _R_CAMERA_SAPIEN
-            taken[name].entity.set_pose(sapien_pose(T_world_sapien))
+        taken = {}
+        for camera, T_world_frame in cameras:
+            T_world_camera = T_world_frame @ camera.T_frame_camera
+            T_world_sapien = T_world_camera.copy()
+            T_world_sapien[:3, :3] = T_world_camera[:3, :3] @ _R_CAMERA_SAPIEN
+            component = self._camera(camera, *size)
+            component.entity.set_pose(sapien_pose(T_world_sapien))
+            taken[camera.name] = component, T_world_camera
         self._system.step()
-        return {name: _view(component, cameras[name][1]) for name, component in taken.items()}
+        return {name: _view(*shown) for name, shown in taken.items()}
 
-    def _camera(self, camera: CameraSpec, size: int) -> Any:
-        key = (camera.name, size)
+    def _camera(self, camera: CameraSpec, width: int, height: int) -> Any:
+        key = (camera.name, camera.fov_y_deg, camera.near, camera.far, width, height)
         if key not in self._cameras:
-            component = sapien.render.RenderCameraComponent(size, size, _shader_folder())
-            K = camera.intrinsics(size, size)
+            component = sapien.render.RenderCameraComponent(width, height, _shader_folder())
+            K = camera.intrinsics(width, height)
             # SAPIEN counts pixels from the picture's corner.
             component.set_perspective_parameters(
                 camera.near, camera.far, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, 0.0

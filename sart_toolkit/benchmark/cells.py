@@ -43,7 +43,8 @@ def demonstrate(
     config: SessionConfig,
 ) -> Demonstration:
     """The scripted operator's demonstration of a task, whether it reached the goal or not."""
-    operator = ScriptedOperator(task.plan(task.initial_state(model, placement)), rng)
+    plan = task.plan(task.initial_state(model, placement))
+    operator = ScriptedOperator(plan, rng, control_hz=backend.rates.control_hz)
     return record_demonstration(backend, task, model, operator, placement, config=config)
 
 
@@ -59,7 +60,7 @@ def recorded(
     placement = cell.task.sample_placement(rng)
     model = RobotModel(backend.robot, backend.scene.held)
     shown = demonstrate(cell.task, backend, model, placement, rng, config)
-    if not cell.task.achieved(shown.success):
+    if not cell.task.achieved(shown.success, shown.rates.record_hz):
         raise Mismatch(f"{cell.name}: the demonstration did not reach the goal; try another --seed")
     return shown
 

@@ -55,12 +55,12 @@ class _Operator:
         row = {"cell": name, "episode": episode, "placement": placement.to_json()}
         try:
             shown = demonstrate(cell.task, backend, model, placement, rng, BLIND)
-            success = cell.task.achieved(shown.success)
+            success = cell.task.achieved(shown.success, shown.rates.record_hz)
             row |= {
                 "success": success,
                 "seconds": float(shown.timestamps[-1]),
                 "force": float(np.nanmax(shown.steps.contact_force)),
-                "reason": None if success else cell.task.shortfall(backend.observe()),
+                "reason": None if success else cell.task.failure_reason(backend.observe()),
             }
         except SartError as error:
             row |= {"success": False, "seconds": None, "force": None, "reason": str(error)}

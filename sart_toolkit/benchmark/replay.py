@@ -55,15 +55,15 @@ def benchmark_replay(
             far, turn, compared = tracking_difference(
                 original, copy, backend.scene, backend.robot.gripper.finger_links
             )
-            reason = task.shortfall(backend.observe())
-        success = task.achieved(copy.success)
+            reason = task.failure_reason(backend.observe())
+        success = task.achieved(copy.success, copy.rates.record_hz)
         rows.append(
             {
                 "task": task.name,
                 "recorded_on": source.backend,
                 "replayed_on": target.backend,
                 "placement": placement.to_json(),
-                "recorded_success": task.achieved(original.success),
+                "recorded_success": task.achieved(original.success, original.rates.record_hz),
                 "replayed_success": success,
                 "reason": None if success else reason,
                 "tool_difference_mm": far * 1e3,

@@ -23,9 +23,8 @@ from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision.world import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
-    CONTROL_HZ,
-    PHYSICS_HZ,
     Annotation,
+    Rates,
     library_versions,
 )
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
@@ -58,9 +57,9 @@ class SegmentsConfig:
 class LimitCheck:
     """How a motion fares against the robot's limits, and what is commanded against its path.
 
-    `ratios`: the greatest joint velocity, acceleration and jerk over their limits, at 240 Hz;
-    `violations`: how many of these samples, joints counted singly, exceed theirs. `off` [m]: how
-    far the tool is at most from the path at what the backend commands at 240 Hz.
+    `ratios`: the greatest joint velocity, acceleration and jerk over their limits, at any physics
+    step; `violations`: how many of these samples, joints counted singly, exceed theirs. `off` [m]:
+    how far the tool is at most from the path at what the backend commands at each physics step.
     """
 
     ratios: tuple[float, float, float]
@@ -68,31 +67,32 @@ class LimitCheck:
     off: float
 
 
-def check_motion(model: RobotModel, motion: Motion, q_start: Array) -> LimitCheck:
-    """A motion's joint velocities, accelerations and jerks, and its commands, looked at at 240 Hz.
+def check_motion(model: RobotModel, motion: Motion, q_start: Array, rates: Rates) -> LimitCheck:
+    """A motion's joint velocities, accelerations and jerks, and its commands, at each physics step.
 
     Args:
         model: the robot.
-        motion: what is commanded, its joints at 30 Hz and straight between.
+        motion: what is commanded, its joints straight between control periods.
         q_start: joints `(n,)` commanded before.
+        rates: how often it is commanded, and how often physics moves it.
     """
     spec = model.spec
     limits = np.array([spec.velocity_limits, spec.acceleration_limits, spec.jerk_limits])
-    times = np.concatenate([[0.0], motion.times(PHYSICS_HZ)])
+    times = np.concatenate([[0.0], motion.times(rates.physics_hz)])
     ratios = np.abs(motion.derivatives(times)) / limits[:, None]
-    targets = np.concatenate([q_start[None], motion.joints(motion.times(CONTROL_HZ))])
-    per_target = PHYSICS_HZ // CONTROL_HZ
+    targets = np.concatenate([q_start[None], motion.joints(motion.times(rates.control_hz))])
+    per_target = rates.physics_per_control
     fraction = np.arange(1, per_target + 1)[:, None] / per_target
     commanded = targets[:-1, None] + fraction * np.diff(targets, axis=0)[:, None]
     commanded = commanded.reshape(-1, len(q_start))
     v, a, j = (float(ratio) for ratio in ratios.max((1, 2)))
     violations = int((ratios > 1.0 + _ROUNDING).sum())
-    return LimitCheck((v, a, j), violations, tool_off_path(model, motion, commanded))
+    return LimitCheck((v, a, j), violations, tool_off_path(model, motion, commanded, rates))
 
 
-def tool_off_path(model: RobotModel, motion: Motion, configurations: Array) -> float:
+def tool_off_path(model: RobotModel, motion: Motion, configurations: Array, rates: Rates) -> float:
     """How far [m] the tool is at most from a motion's path, at configurations `(k, n)`."""
-    on_path = motion.joints(np.concatenate([[0.0], motion.times(PHYSICS_HZ)]))
+    on_path = motion.joints(np.concatenate([[0.0], motion.times(rates.physics_hz)]))
     points = _tool_points(model, configurations)
     off = points - nearest_on_polyline(points, _tool_points(model, on_path))
     return float(np.linalg.norm(off, axis=1).max())
@@ -107,7 +107,7 @@ class _Segments:
 
     def __init__(self, cells: Sequence[Cell], config: SegmentsConfig) -> None:
         self._cells = {cell.name: cell for cell in cells}
-        self._augment = AugmentConfig(seed=config.seed, obstacles=config.obstacles, camera=None)
+        self._augment = AugmentConfig(seed=config.seed, obstacles=config.obstacles, cameras=())
         self._open: tuple[str, Backend, Annotation, SegmentPlanner, RestoreExecutor] | None = None
 
     def _opened(self, name: str) -> tuple[Annotation, SegmentPlanner, RestoreExecutor]:
@@ -135,7 +135,7 @@ class _Segments:
         sphere = annotation.spheres[at]
         started = time.perf_counter()
         proposal, rng = planner.proposal(at, k)
-        model = planner.world.kinematics
+        model, shown = planner.world.kinematics, planner.world.demonstration
         motion: Motion | None = None
         row: dict[str, Any] = {
             "cell": name,
@@ -153,8 +153,8 @@ class _Segments:
         except (Unreachable, MotionRejected):
             pass
         else:
-            commanded = planner.world.demonstration.steps.commanded_joint_positions
-            found = check_motion(model, motion, commanded[proposal.t_star])
+            commanded = shown.steps.commanded_joint_positions
+            found = check_motion(model, motion, commanded[proposal.t_star], shown.rates)
             row["planned"] = {
                 "clearance": certificate.clearance,
                 "duration": motion.duration,
@@ -168,7 +168,7 @@ class _Segments:
             row["measured"] = {
                 "clearance": proof["measured"]["clearance"],
                 "deviation": proof["deviation"],
-                "off": tool_off_path(model, motion, attempt.episode.joint_path),
+                "off": tool_off_path(model, motion, attempt.episode.joint_path, shown.rates),
             }
         return row | {"wall": time.perf_counter() - started}
 

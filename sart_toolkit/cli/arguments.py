@@ -18,7 +18,9 @@ _BACKEND = Annotated[str, arg(help="Simulator or robot to run on.")]
 _ROBOT = Annotated[str | None, arg(help="Robot; the task's own if left out.")]
 _WORKERS = Annotated[int, arg(help="Processes to use.")]
 _SEED = Annotated[int, arg(help="Seed of everything random in this step.")]
-_IMAGE = Annotated[int, arg(help="Width and height of recorded pictures [pixels].")]
+_IMAGE = Annotated[
+    str, arg(help="Size of recorded pictures [pixels]: 128, or width and height as in 160x120.")
+]
 _DEVICE = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Where the policy runs.")]
 _POLICY = Annotated[str, arg(help="Policy: compact_mlp, or resnet18_mlp as in the paper.")]
 _N = Annotated[int, arg(help="Trajectories in all, the demonstration among them.")]
@@ -70,7 +72,7 @@ class Run:
     episodes: _EPISODES = 50
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000
-    image_size: _IMAGE = 128
+    image_size: _IMAGE = "128"
     distribution: _DISTRIBUTION = "paper"
     epochs: Annotated[int | None, arg(help="Training epochs; the policy's own if left out.")] = None
     workers: _WORKERS = 2
@@ -117,7 +119,8 @@ class Record:
     ] = "middle"
     yaw_deg: _YAW = 0.0
     vary_looks: _LOOKS = False
-    image_size: _IMAGE = 128
+    image_size: _IMAGE = "128"
+    cameras: Annotated[str, arg(help="Cameras to record, with commas between.")] = "wrist"
     overwrite: _OVERWRITE = False
     json: _JSON = False
 

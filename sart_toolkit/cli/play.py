@@ -7,7 +7,7 @@ from typing import Any
 
 from sart_toolkit.cli.arguments import Play
 from sart_toolkit.cli.console import progress_bar
-from sart_toolkit.data.records import RECORD_HZ, Demonstration
+from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import check_writable, load_demonstration, load_recording
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile
 from sart_toolkit.poses import check_positive
@@ -87,5 +87,5 @@ def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, A
                 yield frame
                 bar.update(1)
 
-        write_video(args.out, counted(), RECORD_HZ * args.speed)
+        write_video(args.out, counted(), playback.hz * args.speed)
     return said | {"film": str(args.out)}

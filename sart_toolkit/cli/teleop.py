@@ -10,9 +10,9 @@ import numpy as np
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.cli.arguments import Record
 from sart_toolkit.cli.console import say
-from sart_toolkit.data.records import CONTROL_HZ, Demonstration
+from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import append_json_line, check_writable, remove, save_demonstration
-from sart_toolkit.errors import Discarded, InvalidInput, MissingCapability, NoDisplay
+from sart_toolkit.errors import Discarded, InvalidInput, NoDisplay
 from sart_toolkit.motion.controller import ControllerConfig
 from sart_toolkit.record.desk import RecordingDesk
 from sart_toolkit.record.devices.manual import ManualDevice
@@ -35,7 +35,8 @@ def record_by_hand(
 
     Raises:
         Discarded: the person threw it away.
-        MissingCapability: the backend draws no pictures.
+        MissingCapability: the backend takes no pictures.
+        UnknownName: there is no such camera.
         DeviceLost: there is nothing to steer with.
         NoDisplay: no window can be opened.
         MissingExtra: a library isn't installed.
@@ -49,10 +50,8 @@ def record_by_hand(
         if args.status is not None:
             append_json_line(args.status, status)
 
-    if not backend.capabilities.renders:
-        raise MissingCapability(
-            f"backend {backend.name!r} draws no pictures to steer by; use another backend"
-        )
+    cameras = tuple(args.cameras.split(","))
+    backend.check_cameras(cameras)
     if args.status is not None:
         check_writable(args.status, args.overwrite)
         remove(args.status)
@@ -62,9 +61,9 @@ def record_by_hand(
         device.connect()
         robot = backend.robot
         # No joint goes faster than it can, so nothing jumps near the edge of what can be reached.
-        slowest = float(np.min(robot.velocity_limits)) / CONTROL_HZ
+        slowest = float(np.min(robot.velocity_limits)) / backend.rates.control_hz
         config = SessionConfig(
-            cameras=(robot.wrist_camera.name,),
+            cameras=cameras,
             max_seconds=args.max_seconds,
             end_on_success=True,
             controller=ControllerConfig(max_joint_step=slowest),

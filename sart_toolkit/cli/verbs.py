@@ -56,7 +56,7 @@ from sart_toolkit.cli.console import progress_bar, say, show
 from sart_toolkit.cli.play import check_play_options, load_playback, play
 from sart_toolkit.cli.teleop import check_hand_options, record_by_hand
 from sart_toolkit.data.dataset import MANIFEST, Dataset, load_dataset
-from sart_toolkit.data.records import Demonstration, library_versions
+from sart_toolkit.data.records import DEFAULT_RATES, Demonstration, Rates, library_versions
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.data.storage import (
     check_writable,
@@ -81,6 +81,7 @@ from sart_toolkit.report.player import SceneView
 from sart_toolkit.report.video import film_rollout
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import ImageSize, check_image_size
 from sart_toolkit.scenes.appearance import vary_appearance
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
@@ -94,13 +95,20 @@ def run_verb(verb: Any) -> None:
     show(_VERBS[type(verb)](verb), verb.json)
 
 
-def _backend_factory(name: str, task: Task, robot: str | None, image_size: int) -> BackendFactory:
+def _backend_factory(
+    name: str,
+    task: Task,
+    robot: str | None,
+    image_size: ImageSize,
+    rates: Rates = DEFAULT_RATES,
+) -> BackendFactory:
     if name not in BACKENDS:
         raise unknown_name("backend", name, BACKENDS)
-    if image_size < 16:
+    size = check_image_size(image_size)
+    if min(size) < 16:
         raise InvalidInput(f"image_size: expected at least 16 pixels, got {image_size}")
     return functools.partial(
-        make_backend, name, get_robot(robot or task.robot), task.scene, image_size
+        make_backend, name, get_robot(robot or task.robot), task.scene, size, rates
     )
 
 
@@ -110,8 +118,10 @@ def _train_config(policy: str, **given: Any) -> TrainConfig:
     return TrainConfig.for_policy(policy, **chosen)
 
 
-def _image_size(demonstration: Demonstration) -> int:
-    return next(iter(demonstration.steps.cameras.values())).rgb.shape[1]
+def _image_size(demonstration: Demonstration) -> tuple[int, int]:
+    """Width and height of a demonstration's pictures."""
+    height, width = next(iter(demonstration.steps.cameras.values())).rgb.shape[1:3]
+    return width, height
 
 
 def record_verb(args: Record) -> Result:
@@ -122,7 +132,9 @@ def record_verb(args: Record) -> Result:
     if args.vary_looks:
         looks = np.random.default_rng([args.seed, 1])
         varied = vary_appearance(get_robot(args.robot or task.robot), task.scene, looks)
-        make = functools.partial(make_backend, args.backend, *varied, args.image_size)
+        make = functools.partial(
+            make_backend, args.backend, *varied, check_image_size(args.image_size)
+        )
     rng = np.random.default_rng(args.seed)
     placement = Placement()
     if args.placement == "random":
@@ -142,13 +154,14 @@ def record_verb(args: Record) -> Result:
         if isinstance(device, ManualDevice):
             demonstration = record_by_hand(args, backend, task, model, device, placement)
         else:
-            config = SessionConfig(max_seconds=args.max_seconds)
+            config = SessionConfig(tuple(args.cameras.split(",")), args.max_seconds)
             with progress_bar("record", None, "s") as bar:
                 demonstration = record_demonstration(
                     backend, task, model, device, placement, args.seed, config,
                     progress=lambda seconds: bar.update(seconds - bar.n),
                 )  # fmt: skip
-            if not task.achieved(demonstration.success):
+            achieved = task.achieved(demonstration.success, demonstration.rates.record_hz)
+            if demonstration.judged_by == "task" and not achieved:
                 raise Mismatch(
                     "the demonstration did not reach the goal; record again with another --seed"
                 )
@@ -165,8 +178,9 @@ def play_verb(args: Play) -> Result:
         playback.camera = args.camera
         return play(args, playback, None)
     make = _backend_factory(
-        args.backend or shown.backend, get_task(shown.task), shown.robot, _image_size(shown)
-    )
+        args.backend or shown.backend, get_task(shown.task), shown.robot, _image_size(shown),
+        shown.rates,
+    )  # fmt: skip
     with closing(make()) as backend:
         return play(args, playback, SceneView(playback, backend, args.camera))
 
@@ -207,7 +221,11 @@ def augment_verb(args: Augment) -> Result:
     )
     task = get_task(demonstration.task)
     make = _backend_factory(
-        args.backend or demonstration.backend, task, demonstration.robot, _image_size(demonstration)
+        args.backend or demonstration.backend,
+        task,
+        demonstration.robot,
+        _image_size(demonstration),
+        demonstration.rates,
     )
     with progress_bar("augment", args.n - 1, "trajectory") as bar:
 
@@ -304,7 +322,8 @@ def evaluate_verb(args: Evaluate) -> Result:
         args.backend or skill.config.backend,
         task,
         skill.config.robot,
-        skill.config.cameras[skill.cameras[0]].size[0],
+        skill.config.cameras[skill.cameras[0]].size[::-1],
+        skill.demonstration.rates,
     )
     check_writable(args.out, args.overwrite)
     with progress_bar("evaluate", args.episodes, "rollout") as bar:
@@ -603,7 +622,7 @@ def _describe_demonstration(demonstration: Demonstration) -> Result:
         "seconds": float(d.timestamps[-1]),
         "success": bool(d.success[-1]),
         "placement": dict(d.task_parameters.get("placement", {})),
-        "cameras": {k: "x".join(map(str, c.rgb.shape[1:3])) for k, c in d.steps.cameras.items()},
+        "cameras": {k: "x".join(map(str, c.rgb.shape[2:0:-1])) for k, c in d.steps.cameras.items()},
         "operator": d.operator,
         "device": d.device,
         "seconds_spent": round(d.seconds, 1),

@@ -228,7 +228,7 @@ class _View:
         depth[~np.isfinite(depth) | (depth < 0)] = 0.0
         return _View(
             t,
-            demonstration.steps.measured_Ts_world_tool[t] @ camera.T_tool_camera,
+            camera.Ts_world_camera(demonstration.steps.measured_Ts_world_tool[t]),
             camera.intrinsics,
             camera.rgb[t],
             depth,

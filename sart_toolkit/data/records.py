@@ -11,7 +11,7 @@ import numbers
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +31,47 @@ from sart_toolkit.poses import (
 Image = NDArray[np.uint8]
 DepthImage = NDArray[np.float32]
 ACTION_SIZE = 7
-RECORD_HZ = 10
-CONTROL_HZ = 30
-PHYSICS_HZ = 240
-CONTROL_PER_RECORD = CONTROL_HZ // RECORD_HZ
+CameraFrame = Literal["tool", "world"]
+Judge = Literal["task", "person", "nobody"]
 # nu_r [rad/m]: rotation drawn per metre of radius, the published code's value.
 ROTATION_PER_METRE = 2.0
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How often things happen [Hz]: physics steps, commands, recorded steps; each divides the last.
+
+    On hardware `physics_hz` is how often the joints can be measured. A policy acts at `record_hz`.
+    """
+
+    physics_hz: int = 240
+    control_hz: int = 30
+    record_hz: int = 10
+
+    def __post_init__(self) -> None:
+        for field_ in dataclasses.fields(self):
+            value = getattr(self, field_.name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise InvalidInput(f"{field_.name}: expected a whole number >= 1, got {value!r}")
+        for fast, slow in (("physics_hz", "control_hz"), ("control_hz", "record_hz")):
+            if getattr(self, fast) % getattr(self, slow):
+                raise InvalidInput(
+                    f"{fast}: expected a multiple of {slow} ({getattr(self, slow)} Hz), got "
+                    f"{getattr(self, fast)} Hz"
+                )
+
+    @property
+    def physics_per_control(self) -> int:
+        """Physics steps in a control period."""
+        return self.physics_hz // self.control_hz
+
+    @property
+    def control_per_record(self) -> int:
+        """Control periods in a recorded step."""
+        return self.control_hz // self.record_hz
+
+
+DEFAULT_RATES = Rates()
 
 
 def actions_from_commands(commanded_Ts_world_tool: Array, commanded_gripper: Array) -> Array:
@@ -104,13 +139,15 @@ def digest(parts: Mapping[str, Any]) -> str:
 class CameraRecord:
     """What one camera saw: `rgb (T,H,W,3)` uint8, `depth (T,H,W)` float32 metres (0: nothing hit).
 
-    `intrinsics (3,3)` in pixels; `T_tool_camera (4,4)`, camera frame z forward, x right, y down.
+    `intrinsics (3,3)` in pixels; `frame`: what the camera is mounted on, the tool or the world;
+    `T_frame_camera (4,4)`: where it is there, camera frame z forward, x right, y down.
     """
 
     rgb: Image
     depth: DepthImage
     intrinsics: Array
-    T_tool_camera: Array
+    frame: CameraFrame
+    T_frame_camera: Array
 
     def __post_init__(self) -> None:
         rgb = np.asarray(self.rgb)
@@ -125,14 +162,21 @@ class CameraRecord:
         object.__setattr__(self, "depth", frozen(depth, np.float32))
         intrinsics = check_array("intrinsics", self.intrinsics, (3, 3))
         object.__setattr__(self, "intrinsics", frozen(intrinsics))
-        object.__setattr__(
-            self, "T_tool_camera", frozen(check_pose("T_tool_camera", self.T_tool_camera))
-        )
+        if self.frame not in get_args(CameraFrame):
+            raise InvalidInput(f"frame: expected 'tool' or 'world', got {self.frame!r}")
+        T = check_pose("T_frame_camera", self.T_frame_camera)
+        object.__setattr__(self, "T_frame_camera", frozen(T))
+
+    def Ts_world_camera(self, Ts_world_tool: Array) -> Array:
+        """Where the camera was `(4, 4)` or `(n, 4, 4)` when the tool was at as many poses."""
+        if self.frame == "tool":
+            return Ts_world_tool @ self.T_frame_camera
+        return np.broadcast_to(self.T_frame_camera, np.shape(Ts_world_tool))
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Recorded 10 Hz steps of a robot: what it measured, what it was commanded, what it saw.
+    """Recorded steps of a robot: what it measured, what it was commanded, what it saw.
 
     `joint_positions`, `joint_velocities`, `commanded_joint_positions` are `(T, n)` [rad, rad/s];
     `measured_Ts_world_tool`, `commanded_Ts_world_tool` are `(T, 4, 4)`; `measured_gripper` and
@@ -189,14 +233,15 @@ class Steps:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One demonstration: its 10 Hz steps, the bodies, and what it takes to start from any step.
+    """One demonstration: its steps, the bodies, and what it takes to start from any step.
 
-    `timestamps (T,)` [s]; `body_Ts_world` maps body names to `(T, 4, 4)` (empty on hardware);
-    `success (T,)` bool per step; `touching`: for each step the pairs of names of bodies that have
-    touched since the step before (none where the backend can't tell); `raw_commands (M, 7)`: the
-    operator's 30 Hz tool velocity (xyz [m/s], rotation [rad/s], tool frame) and gripper target;
-    `states`: the backend's portable state at each step (empty where it has none); `seconds`:
-    wall-clock time the person spent.
+    `rates`: how often it was commanded and recorded; `timestamps (T,)` [s]; `body_Ts_world` maps
+    body names to `(T, 4, 4)` (empty on hardware); `success (T,)` bool per step, as `judged_by`
+    says: the task's own test, a person, or nobody (then it is false throughout); `touching`: for
+    each step the pairs of names of bodies that have touched since the step before (none where the
+    backend can't tell); `raw_commands (M, 7)`: the operator's tool velocity in each control period
+    (xyz [m/s], rotation [rad/s], tool frame) and gripper target; `states`: the backend's portable
+    state at each step (empty where it has none); `seconds`: wall-clock time the person spent.
     """
 
     task: str
@@ -215,8 +260,14 @@ class Demonstration:
     seconds: float
     seed: int | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
+    rates: Rates = DEFAULT_RATES
+    judged_by: Judge = "task"
 
     def __post_init__(self) -> None:
+        if self.judged_by not in get_args(Judge):
+            raise InvalidInput(
+                f"judged_by: expected one of {list(get_args(Judge))}, got {self.judged_by!r}"
+            )
         n = len(self.steps)
         if n < 2:
             raise InvalidInput(f"demonstration: needs at least 2 steps, got {n}; record it again")
@@ -264,6 +315,7 @@ class Demonstration:
                 "raw_commands": self.raw_commands,
                 "success": self.success,
                 "touching": self.touching,
+                "rates": dataclasses.asdict(self.rates),
                 "task": self.task,
                 "task_parameters": dict(self.task_parameters),
                 "robot": self.robot,

@@ -29,6 +29,7 @@ from sart_toolkit.data.records import (
     Episode,
     PrecisionSphere,
     Provenance,
+    Rates,
     Steps,
 )
 from sart_toolkit.errors import (
@@ -385,7 +386,8 @@ def _put_steps(group: h5py.Group, steps: Steps) -> None:
                 part, data=frames, chunks=(1, *frames.shape[1:]), compression="lzf", shuffle=True
             )
         at["intrinsics"] = camera.intrinsics
-        at["T_tool_camera"] = camera.T_tool_camera
+        at["T_frame_camera"] = camera.T_frame_camera
+        at.attrs["frame"] = camera.frame
 
 
 def _get_steps(group: h5py.Group) -> Steps:
@@ -394,7 +396,8 @@ def _get_steps(group: h5py.Group) -> Steps:
             rgb=at["rgb"][()],
             depth=at["depth"][()],
             intrinsics=at["intrinsics"][()],
-            T_tool_camera=at["T_tool_camera"][()],
+            frame=at.attrs["frame"],
+            T_frame_camera=at["T_frame_camera"][()],
         )
         for name, at in group.get("cameras", {}).items()
     }
@@ -432,6 +435,8 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
                 "seconds": d.seconds,
                 "seed": d.seed,
                 "versions": dict(d.versions),
+                "rates": dataclasses.asdict(d.rates),
+                "judged_by": d.judged_by,
                 "content_hash": d.content_hash(),
             }
         )
@@ -458,6 +463,7 @@ def load_demonstration(path: Path) -> Demonstration:
             touching=json.loads(file["touching"][()]),
             body_Ts_world={k: v[()] for k, v in file.get("body_Ts_world", {}).items()},
             states=tuple(packed[a:b] for a, b in zip(starts, ends, strict=True)),
+            rates=Rates(**meta.pop("rates")),
             **meta,
         )
         if demonstration.content_hash() != expected:

@@ -14,14 +14,16 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from sart_toolkit.backends.interface import Backend, BackendFactory
-from sart_toolkit.data.records import (
-    CONTROL_PER_RECORD,
-    RECORD_HZ,
-    Image,
-    apply_action,
-    library_versions,
+from sart_toolkit.backends.interface import (
+    Backend,
+    BackendFactory,
+    Draws,
+    Observation,
+    Resets,
+    missing_abilities,
+    require,
 )
+from sart_toolkit.data.records import Image, Rates, apply_action, library_versions
 from sart_toolkit.data.storage import write_json
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
@@ -48,8 +50,8 @@ class Moment:
     success: bool
 
 
-# Makes a film, at a path, of a rollout's moments, its number and its outcome.
-Film = Callable[[Path, Sequence[Moment], int, Literal["success", "failure"]], object]
+# Makes a film, at a path, of a rollout's moments at a rate [1/s], its number and its outcome.
+Film = Callable[[Path, Sequence[Moment], float, int, Literal["success", "failure"]], object]
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def run_rollout(
     model: RobotModel,
     placement: Placement,
     seed: tuple[int, int] = (0, 0),
-    watch: Callable[[Image, int, bool], None] | None = None,
+    watch: Callable[[Observation, int, bool], None] | None = None,
 ) -> Rollout:
     """Let a skill act from a task's start until success has lasted, or the horizon ends.
 
@@ -123,11 +125,19 @@ def run_rollout(
         model: the robot's kinematics.
         placement: where the object stands.
         seed: (evaluation seed, episode), for the record.
-        watch: called at the start and after each 10 Hz step with the image of the skill's first
-            camera, the number of steps done and whether the goal is reached.
+        watch: called at the start and after each step with what is observed, the number of steps
+            done and whether the goal is reached.
+
+    Raises:
+        MissingCapability: the backend can't be reset, or lacks what the task's success needs.
+        InvalidInput: the backend's control rate is no multiple of the rate that the skill acts at.
     """
+    for ability in task.observes:
+        require(backend, ability, f"the success of task {task.name!r} is judged by it")
     state = task.initial_state(model, placement)
-    backend.reset(state)
+    require(backend, Resets, "a rollout begins at the task's start").reset(state)
+    record_hz = skill.demonstration.rates.record_hz
+    rates = Rates(backend.rates.physics_hz, backend.rates.control_hz, record_hz)
     controller = ToolController(model)
     controller.reset(state.q)
     skill.reset()
@@ -137,31 +147,32 @@ def run_rollout(
     step = 0
     observation = backend.observe(skill.cameras)
     if watch is not None:
-        watch(observation.cameras[skill.cameras[0]].rgb, step, False)
-    while step < round(task.horizon * RECORD_HZ):
+        watch(observation, step, False)
+    while step < round(task.horizon * record_hz):
         images = {name: observation.cameras[name].rgb for name in skill.cameras}
         action = skill.act(images, observation.gripper)
         desired, gripper = apply_action(controller.commanded_T_world_tool, action)
         try:
-            targets = controller.move(desired, observation.T_world_tool, CONTROL_PER_RECORD)
+            targets = controller.move(desired, observation.T_world_tool, rates.control_per_record)
         except (Unreachable, MotionRejected) as error:
             reason = f"steered out of reach: {str(error).split(':')[0]}"
             break
         for q in targets:
-            backend.command(q, gripper)
+            sent = backend.command(q, gripper)
             backend.step()
+        controller.acknowledge(sent.q)
         step += 1
         observation = backend.observe(skill.cameras)
         success = task.success(observation)
         success_any = success_any or success
         held = held + 1 if success else 0
         if watch is not None:
-            watch(observation.cameras[skill.cameras[0]].rgb, step, success)
-        if held >= round(task.hold * RECORD_HZ):
+            watch(observation, step, success)
+        if held >= round(task.hold * record_hz):
             break
     success = task.success(observation)
     if not success and reason is None:
-        reason = task.shortfall(observation)
+        reason = task.failure_reason(observation)
     return Rollout(
         seed[1], seed, placement, success, success_any, step, None if success else reason
     )
@@ -187,7 +198,7 @@ class _Worker:
         self.model = RobotModel(self.backend.robot, self.backend.scene.held)
 
     def __call__(
-        self, episode: int, watch: Callable[[Image, int, bool], None] | None = None
+        self, episode: int, watch: Callable[[Observation, int, bool], None] | None = None
     ) -> Rollout:
         seed = self.config.eval_seed
         placement = episode_placement(self.task, seed, episode, self.config.yaw_deg)
@@ -195,7 +206,8 @@ class _Worker:
             rng = np.random.default_rng([seed, episode, 1])
             robot, scene = vary_appearance(self.model.spec, self.task.scene, rng)
             self.backend.close()
-            self.backend = type(self.backend)(robot, scene, self.backend.image_size)
+            old = self.backend
+            self.backend = type(old)(robot, scene, old.image_size, old.rates)
         return run_rollout(
             self.skill, self.task, self.backend, self.model, placement, (seed, episode), watch
         )
@@ -302,8 +314,10 @@ def _videos(
     rollouts: list[Rollout], worker: _Worker, config: EvaluateConfig, directory: Path, film: Film
 ) -> list[dict[str, Any]]:
     """Run the first successes and failures again, seen from outside as well, and film them."""
-    if _OVERVIEW not in worker.backend.cameras:
-        _log.warning("no videos: the scene has no camera named %r", _OVERVIEW)
+    if _OVERVIEW not in worker.backend.cameras or missing_abilities(worker.backend, [Draws]):
+        _log.warning(
+            "no videos: the scene has no camera named %r, or the backend can't draw it", _OVERVIEW
+        )
         return []
     rows = []
     outcomes: tuple[Literal["success", "failure"], ...] = ("success", "failure")
@@ -311,17 +325,24 @@ def _videos(
         chosen = [r for r in rollouts if r.success == (outcome == "success")]
         for rollout in chosen[: config.videos]:
             name = f"videos/{outcome}_{rollout.episode:03d}.mp4"
-            film(directory / name, _moments(worker, rollout.episode), rollout.episode, outcome)
+            hz = worker.skill.demonstration.rates.record_hz
+            film(directory / name, _moments(worker, rollout.episode), hz, rollout.episode, outcome)
             rows.append({"path": name, "episode": rollout.episode, "outcome": outcome})
     return rows
 
 
 def _moments(worker: _Worker, episode: int) -> list[Moment]:
     moments: list[Moment] = []
+    hz = worker.skill.demonstration.rates.record_hz
 
-    def watch(wrist: Image, step: int, success: bool) -> None:
-        overview = worker.backend.observe((_OVERVIEW,), _VIDEO_SIZE).cameras[_OVERVIEW].rgb
-        moments.append(Moment(overview, wrist, step / RECORD_HZ, success))
+    def watch(seen: Observation, step: int, success: bool) -> None:
+        # With varied appearance each rollout has a backend of its own.
+        backend = worker.backend
+        state = backend.scene.seen_state(seen.q, seen.gripper, seen.Ts_world_body)
+        stage = require(backend, Draws, "videos of rollouts are drawn from outside")
+        view = stage.draw(state, backend.cameras[_OVERVIEW], _VIDEO_SIZE, _VIDEO_SIZE).rgb
+        wrist = seen.cameras[worker.skill.cameras[0]].rgb
+        moments.append(Moment(view, wrist, step / hz, success))
 
     worker(episode, watch)
     return moments

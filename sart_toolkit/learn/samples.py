@@ -320,11 +320,12 @@ def _check_same_camera(
     if (
         camera.rgb.shape[1:] != reference.rgb.shape[1:]
         or not np.allclose(camera.intrinsics, reference.intrinsics)
-        or not np.allclose(camera.T_tool_camera, reference.T_tool_camera, rtol=0, atol=1e-5)
+        or camera.frame != reference.frame
+        or not np.allclose(camera.T_frame_camera, reference.T_frame_camera, rtol=0, atol=1e-5)
     ):
         raise Mismatch(
-            f"episode {i}: camera {name!r} has another size, intrinsics or T_tool_camera than in "
-            "the demonstration; generate again with the same camera"
+            f"episode {i}: camera {name!r} has another size, intrinsics or mounting than in the "
+            "demonstration; generate again with the same camera"
         )
 
 

@@ -51,7 +51,8 @@ class SkillCamera:
 
     size: tuple[int, int]
     intrinsics: Array
-    T_tool_camera: Array
+    frame: str
+    T_frame_camera: Array
 
     def __post_init__(self) -> None:
         size = tuple(self.size)
@@ -60,15 +61,16 @@ class SkillCamera:
         object.__setattr__(self, "size", size)
         intrinsics = check_array("intrinsics", self.intrinsics, (3, 3))
         object.__setattr__(self, "intrinsics", frozen(intrinsics))
-        T_tool_camera = check_pose("T_tool_camera", self.T_tool_camera)
-        object.__setattr__(self, "T_tool_camera", frozen(T_tool_camera))
+        T_frame_camera = check_pose("T_frame_camera", self.T_frame_camera)
+        object.__setattr__(self, "T_frame_camera", frozen(T_frame_camera))
 
     def to_json(self) -> dict[str, Any]:
         """The camera as JSON values."""
         return {
             "size": list(self.size),
             "intrinsics": self.intrinsics.tolist(),
-            "T_tool_camera": self.T_tool_camera.tolist(),
+            "frame": self.frame,
+            "T_frame_camera": self.T_frame_camera.tolist(),
         }
 
 
@@ -144,7 +146,7 @@ def _check_keys(what: str, value: Any, record: type) -> None:
 
 
 class Skill:
-    """A trained policy that remembers its own history: `reset()`, then `act(...)` at 10 Hz.
+    """A trained policy that remembers its own history: `reset()`, then `act(...)` at its rate.
 
     Attributes:
         config: what must be known to execute it elsewhere.
@@ -289,7 +291,10 @@ def save_skill(
         backend=demonstration.backend,
         cameras={
             name: SkillCamera(
-                (camera.rgb.shape[1], camera.rgb.shape[2]), camera.intrinsics, camera.T_tool_camera
+                (camera.rgb.shape[1], camera.rgb.shape[2]),
+                camera.intrinsics,
+                camera.frame,
+                camera.T_frame_camera,
             )
             for name, camera in recorded.items()
         },

@@ -69,6 +69,17 @@ class ToolController:
         )
         self._q, self._T = q, T
 
+    def acknowledge(self, q_sent: Array) -> None:
+        """Go on from the joint targets `(n,)` that the robot was really sent.
+
+        They are the last ones of `move` or `follow`, unless the robot can't go so far in one step.
+
+        Raises:
+            InvalidInput: not a joint configuration.
+        """
+        if not np.array_equal(q_sent, self._q):
+            self.reset(q_sent)
+
     @property
     def commanded_T_world_tool(self) -> Array:
         """The tool pose `(4, 4)` commanded last."""

@@ -6,6 +6,7 @@ import functools
 
 import numpy as np
 
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import MotionRejected
 from sart_toolkit.motion.path import SplinePath
 from sart_toolkit.motion.timing import Motion, timed
@@ -24,6 +25,7 @@ def straight_line(
     duration: float,
     max_joint_step: float = 0.35,
     deviation: float = 2e-5,
+    record_hz: int = DEFAULT_RATES.record_hz,
 ) -> Motion:
     """The motion of the tool in a straight line, in `duration` or as much longer as joints need.
 
@@ -38,6 +40,7 @@ def straight_line(
         duration: seconds from rest to rest, if the limits allow.
         max_joint_step: greatest joint motion [rad] between neighbouring knots.
         deviation: how far the tool may be from the line, [m] and [rad].
+        record_hz: recorded steps a second.
 
     Raises:
         InvalidInput: not a pose, or duration or deviation not positive.
@@ -67,7 +70,7 @@ def straight_line(
             for q, s in zip(path.positions(looked_at), looked_at, strict=True)
         )
         if off <= deviation:
-            return timed(model, path, duration, T_at)
+            return timed(model, path, duration, T_at, record_hz)
         if 2 * count > _MOST:
             raise MotionRejected(
                 f"joint path: {off * 1e3:.2f} mm off the line with {count} knots, a joint turns "

@@ -20,7 +20,7 @@ from scipy.interpolate import BSpline
 
 from sart_toolkit.collision.certificate import Certificate, certify
 from sart_toolkit.collision.model import PlacedModel, gap_text
-from sart_toolkit.data.records import RECORD_HZ
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import InvalidInput, MissingExtra, MotionRejected, Unreachable
 from sart_toolkit.motion.path import PolylinePath, SplinePath
 from sart_toolkit.motion.timing import Motion, timed
@@ -95,6 +95,7 @@ def plan_motion(
     margin: float,
     rng: np.random.Generator,
     config: PlanConfig | None = None,
+    record_hz: int = DEFAULT_RATES.record_hz,
 ) -> tuple[Motion, Certificate]:
     """A motion round obstacles to a tool pose, and the proof that its path is clear.
 
@@ -108,6 +109,7 @@ def plan_motion(
         margin: clearance [m] to keep, >= 0.
         rng: decides the path.
         config: how it is looked for.
+        record_hz: recorded steps a second.
 
     Raises:
         MissingExtra: OMPL isn't installed.
@@ -125,12 +127,12 @@ def plan_motion(
         raise _too_close("sampled pose", placed, goals[0], margin, "use a smaller radius")
     path, certificate = plan_path(placed, q_start, clear[0], margin, rng, config)
     T_at = functools.partial(_tool_pose, model, path)
-    motion = timed(model, path, duration, T_at)
-    excess = _longest_stride(motion, config)
+    motion = timed(model, path, duration, T_at, record_hz)
+    excess = _longest_stride(motion, config, record_hz)
     if excess > 1:
         # Ramps don't grow with the duration, so that speeds fall by more than this.
-        slower = float(np.ceil(motion.duration * excess * RECORD_HZ)) / RECORD_HZ
-        motion = timed(model, path, slower, T_at)
+        slower = float(np.ceil(motion.duration * excess * record_hz)) / record_hz
+        motion = timed(model, path, slower, T_at, record_hz)
     return motion, certificate
 
 
@@ -219,9 +221,9 @@ def _tool_pose(model: RobotModel, path: SplinePath, s: float) -> Array:
     return model.fk(path.positions(np.array([s]))[0])
 
 
-def _longest_stride(motion: Motion, config: PlanConfig) -> float:
+def _longest_stride(motion: Motion, config: PlanConfig, record_hz: int) -> float:
     """The tool's longest stride during one recorded step, as a share of what is allowed."""
-    period, largest = 1 / RECORD_HZ, np.deg2rad(config.stride_deg)
+    period, largest = 1 / record_hz, np.deg2rad(config.stride_deg)
     ends = np.append(np.arange(period, motion.duration, period / _STRIDES), motion.duration)
     strides = [
         distance(motion.T_world_tool(end - period), motion.T_world_tool(end)) for end in ends

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, Trajectory
 
-from sart_toolkit.data.records import RECORD_HZ
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import MotionRejected
 from sart_toolkit.motion.path import SplinePath
 from sart_toolkit.poses import Array, check_positive
@@ -80,7 +80,11 @@ class Motion:
 
 
 def timed(
-    model: RobotModel, path: SplinePath, duration: float, T_at: Callable[[float], Array]
+    model: RobotModel,
+    path: SplinePath,
+    duration: float,
+    T_at: Callable[[float], Array],
+    record_hz: int = DEFAULT_RATES.record_hz,
 ) -> Motion:
     """The motion along a joint path that takes `duration`, or as much longer as the joints need.
 
@@ -96,6 +100,7 @@ def timed(
         path: its joint path.
         duration: seconds from rest to rest, if the limits allow.
         T_at: the tool pose `(4, 4)` at a path parameter.
+        record_hz: recorded steps a second.
 
     Raises:
         InvalidInput: duration not positive.
@@ -111,18 +116,18 @@ def timed(
     law = _law(path, model.spec, duration)
     if law is None:
         # In recorded steps: the fewest that are enough, and some that aren't.
-        enough, few = round(_LONGEST * RECORD_HZ), int(duration * RECORD_HZ)
+        enough, few = round(_LONGEST * record_hz), int(duration * record_hz)
         if few >= enough or _law(path, model.spec, _LONGEST) is None:
             raise MotionRejected(
                 f"joint limits: the path needs more than {_LONGEST:.0f} s; sample nearer"
             )
         while enough - few > 1:
             middle = (enough + few) // 2
-            if _law(path, model.spec, middle / RECORD_HZ) is None:
+            if _law(path, model.spec, middle / record_hz) is None:
                 few = middle
             else:
                 enough = middle
-        duration = enough / RECORD_HZ
+        duration = enough / record_hz
         law = _law(path, model.spec, duration)
         assert law is not None
     return Motion(path, duration, T_at, law)

@@ -53,7 +53,7 @@ class RecordingDesk:
             session: the recording.
             device: what the person steers with, connected.
             save: writes a demonstration; if it raises a `SartError` it can be tried again.
-            watch: called with JSON values after each 10 Hz step and each change of state.
+            watch: called with JSON values after each recorded step and each change of state.
         """
         self.session, self.device = session, device
         self.demonstration: Demonstration | None = None
@@ -98,7 +98,11 @@ class RecordingDesk:
         session = self.session
         if session.achieved:
             return Notice("Goal reached. Press → to save.", "good")
-        why = session.task.shortfall(session.observation)
+        if session.judged_by == "nobody":
+            return Notice(
+                "Was the goal reached? → saves it as reached, ← records again.", "warning"
+            )
+        why = session.failure_reason
         if session.success:
             why = "not kept for long enough"
         text = f"Goal not reached: {why}."
@@ -107,7 +111,7 @@ class RecordingDesk:
         return Notice(f"{text} ← records again; → twice saves it nevertheless.", "warning")
 
     def tick(self) -> None:
-        """One control period: the device is read and, while recording, the robot moves by 1/30 s.
+        """One control period: the device is read and, while recording, the robot moves.
 
         A device that no longer answers pauses the recording; nothing is lost.
         """
@@ -150,6 +154,9 @@ class RecordingDesk:
                 self._go_on()
             case SessionState.RECORDING:
                 session.stop()
+            case SessionState.ENDED if session.judged_by == "nobody":
+                session.say_reached()
+                self._keep()
             case SessionState.ENDED if session.achieved or again:
                 self._keep()
             case SessionState.ENDED:

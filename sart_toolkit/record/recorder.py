@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from sart_toolkit.backends.interface import Backend, Observation
-from sart_toolkit.data.records import CameraRecord, Steps
+from sart_toolkit.data.records import CameraFrame, CameraRecord, Steps
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.poses import Array, inverse
+from sart_toolkit.robots.model import RobotModel
 
 
 class StepRecorder:
@@ -19,10 +21,30 @@ class StepRecorder:
         observations: what was measured, a row each.
     """
 
-    def __init__(self, backend: Backend, cameras: Sequence[str]) -> None:
-        """Record `backend` with the named cameras' pictures."""
+    def __init__(self, backend: Backend, model: RobotModel, cameras: Sequence[str]) -> None:
+        """Record `backend` with the named cameras' pictures.
+
+        Args:
+            backend: the robot.
+            model: its kinematics, which tell what each camera is mounted on.
+            cameras: names of cameras that move with the tool or stand still.
+
+        Raises:
+            UnknownName: there is no such camera.
+            MissingCapability: the backend takes no pictures.
+            InvalidInput: a camera is mounted on a part of the arm before the tool.
+        """
+        backend.check_cameras(cameras)
         self._backend = backend
-        self._cameras = tuple(cameras)
+        self._frames: dict[str, CameraFrame] = {}
+        for name in cameras:
+            frame = model.mount_of(backend.cameras[name].frame)
+            if frame is None:
+                raise InvalidInput(
+                    f"camera {name!r}: its frame {backend.cameras[name].frame!r} neither moves "
+                    "with the tool nor stands still; record another camera"
+                )
+            self._frames[name] = frame
         self.observations: list[Observation] = []
         self._commanded_q: list[Array] = []
         self._commanded_T: list[Array] = []
@@ -31,7 +53,7 @@ class StepRecorder:
 
     def add(self, controller: ToolController, gripper: float, force: float) -> Observation:
         """Measure and keep it, with the command in force and the contact force until now [N]."""
-        observation = self._backend.observe(self._cameras)
+        observation = self._backend.observe(tuple(self._frames))
         self.observations.append(observation)
         self._commanded_q.append(controller.commanded_q)
         self._commanded_T.append(controller.commanded_T_world_tool)
@@ -43,16 +65,15 @@ class StepRecorder:
         """The rows recorded, or some of them in the order of a slice (reversed, for instance)."""
         rows = self.observations[order]
         spec = self._backend.cameras
-        size = self._backend.image_size
-        T_world_tool = rows[0].T_world_tool
         cameras = {}
-        for name in self._cameras:
-            T_world_camera = rows[0].cameras[name].T_world_camera
+        for name, frame in self._frames.items():
+            T_world_frame = rows[0].T_world_tool if frame == "tool" else np.eye(4)
             cameras[name] = CameraRecord(
                 rgb=np.stack([row.cameras[name].rgb for row in rows]),
                 depth=np.stack([row.cameras[name].depth for row in rows]),
-                intrinsics=spec[name].intrinsics(size, size),
-                T_tool_camera=inverse(T_world_tool) @ T_world_camera,
+                intrinsics=spec[name].intrinsics(*self._backend.image_size),
+                frame=frame,
+                T_frame_camera=inverse(T_world_frame) @ rows[0].cameras[name].T_world_camera,
             )
         return Steps(
             joint_positions=np.stack([row.q for row in rows]),

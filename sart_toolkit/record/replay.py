@@ -15,7 +15,7 @@ from sart_toolkit.tasks.task import Placement, Task
 
 
 class ReplayDevice(Device):
-    """Gives the 30 Hz commands of a demonstration again, whatever the robot measures."""
+    """Gives the commands of a demonstration again, whatever the robot measures."""
 
     name = "replay"
 
@@ -50,11 +50,12 @@ def replay_demonstration(
         config: cameras and limits.
 
     Raises:
-        Mismatch: the demonstration is of another task or robot.
+        Mismatch: the demonstration is of another task or robot, or at other rates.
     """
     for what, was, now in (
         ("task", demonstration.task, task.name),
         ("robot", demonstration.robot, model.spec.name),
+        ("control rate", demonstration.rates.control_hz, backend.rates.control_hz),
     ):
         if was != now:
             raise Mismatch(f"replay: the demonstration is of {what} {was!r}, not {now!r}")

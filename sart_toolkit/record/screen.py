@@ -215,8 +215,12 @@ class Screen:
         self._pygame.draw.circle(self._canvas, colour, at, radius)
 
     def picture(self, box: Box, rgb: Image) -> None:
-        """A picture `(H, W, 3)` uint8, scaled to a box."""
+        """A picture `(H, W, 3)` uint8, scaled to fit into the middle of a box."""
         left, top, width, height = box
+        scale = min(width / rgb.shape[1], height / rgb.shape[0])
+        left += (width - round(scale * rgb.shape[1])) // 2
+        top += (height - round(scale * rgb.shape[0])) // 2
+        width, height = (round(scale * n) for n in rgb.shape[1::-1])
         pixels = np.ascontiguousarray(rgb)
         surface = self._pygame.image.frombuffer(pixels, pixels.shape[1::-1], "RGB")
         if surface.get_size() != (width, height):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sart_toolkit.backends.interface import Observation
-from sart_toolkit.data.records import CONTROL_HZ
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import check_positive, relative_motion
 from sart_toolkit.record.session import Device, DeviceSetup, TeleopCommand
@@ -56,6 +56,7 @@ class ScriptedOperator(Device):
         stages: Sequence[Stage],
         rng: np.random.Generator,
         style: OperatorStyle | None = None,
+        control_hz: int = DEFAULT_RATES.control_hz,
     ) -> None:
         """Follow `stages` in order, with the hand's noise drawn from `rng`.
 
@@ -67,6 +68,7 @@ class ScriptedOperator(Device):
         self._stages = list(stages)
         self._rng = rng
         self._style = style or OperatorStyle()
+        self._dt = 1.0 / control_hz
         self._leg = 0
         self._paused = 0.0
         self._still = 0.0
@@ -75,7 +77,7 @@ class ScriptedOperator(Device):
         self._tremor = np.zeros(6)
 
     def read(self, observation: Observation) -> TeleopCommand:
-        style, dt = self._style, 1.0 / CONTROL_HZ
+        style, dt = self._style, self._dt
         stage = self._stages[self._leg]
         error = relative_motion(observation.T_world_tool, stage.T_world_tool)
         far, turn = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
@@ -115,4 +117,5 @@ class ScriptedOperator(Device):
 
 def scripted_operator(setup: DeviceSetup) -> ScriptedOperator:
     """The operator for a recording, following its task's plan."""
-    return ScriptedOperator(setup.task.plan(setup.state), setup.rng)
+    hz = setup.backend.rates.control_hz
+    return ScriptedOperator(setup.task.plan(setup.state), setup.rng, control_hz=hz)

@@ -1,7 +1,7 @@
-"""Teleoperation: a device steers the tool at 30 Hz, the session records at 10 Hz.
+"""Teleoperation: a device steers the tool at the control rate, the session records its steps.
 
 `TeleopSession` is the recording itself, moved on by whoever calls it: `record_demonstration` for a
-script, `teach.desk` for a person.
+script, `record.desk` for a person.
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ from typing import Literal
 
 import numpy as np
 
-from sart_toolkit.backends.interface import Backend, Contact, Observation
-from sart_toolkit.data.records import (
-    CONTROL_HZ,
-    CONTROL_PER_RECORD,
-    RECORD_HZ,
-    Demonstration,
-    library_versions,
+from sart_toolkit.backends.interface import (
+    Backend,
+    Contact,
+    Observation,
+    Resets,
+    SavesStates,
+    SensesContacts,
+    SensesForce,
+    missing_abilities,
 )
+from sart_toolkit.data.records import Demonstration, Judge, library_versions
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.motion.controller import ControllerConfig, ToolController
 from sart_toolkit.poses import Array, apply_motion, check_array, check_positive, frozen
@@ -42,7 +45,7 @@ _AT_LIMIT = 0.05
 
 @dataclass(frozen=True)
 class TeleopCommand:
-    """What a device asks for over the next 1/30 s.
+    """What a device asks for over the next control period.
 
     `velocity (6,)`: of the tool in the tool's frame, xyz [m/s] and rotation [rad/s]; `gripper` in
     [0, 1]; `stop` ends the recording before the command is carried out.
@@ -90,7 +93,7 @@ class Device(abc.ABC):
 
     @abc.abstractmethod
     def read(self, observation: Observation) -> TeleopCommand:
-        """The command for the next 1/30 s, having seen what the robot measures now."""
+        """The command for the next control period, having seen what the robot measures now."""
 
 
 @dataclass(frozen=True)
@@ -132,11 +135,16 @@ class End(enum.Enum):
 class TeleopSession:
     """A demonstration in the making: ready, recording, paused, ended, saved.
 
-    It never waits and draws nothing: each `advance` is one control period, 1/30 s, of simulation.
-    While it isn't recording the simulation stands still.
+    It draws nothing, and only the backend makes it wait: each `advance` is one control period.
+    While it isn't recording a simulation stands still.
+
+    A backend that can't be reset is recorded from wherever the robot is, and its placement is what
+    it is told. One that lacks what the task's success is judged by records no success; a person may
+    say that the goal was reached, see `say_reached`.
 
     Attributes:
         state: what it is at.
+        judged_by: who tells whether the goal is reached: the task, a person, or nobody yet.
         end: why it ended, once it has.
         gripper: the gripper command in force, in [0, 1].
         trouble: why the last command was not carried out; empty where it was.
@@ -153,7 +161,7 @@ class TeleopSession:
         config: SessionConfig | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Ready to record, robot and scene as at the task's start.
+        """Ready to record, robot and scene as at the task's start if the backend can be reset.
 
         Args:
             backend: the robot in the task's scene.
@@ -162,6 +170,10 @@ class TeleopSession:
             placement: where the object stands; in the middle of its range if left out.
             config: cameras and limits.
             clock: tells the wall-clock time [s].
+
+        Raises:
+            UnknownName: there is no such camera.
+            MissingCapability: the backend takes no pictures.
         """
         self.backend, self.task, self.model = backend, task, model
         self.placement = placement or Placement()
@@ -170,26 +182,39 @@ class TeleopSession:
         self._started_at: float | None = None
         self._seconds_spent = 0.0
         self._controller = ToolController(model, self.config.controller)
-        self._feels = backend.capabilities.has_contacts
-        self._keeps = backend.capabilities.can_restore and self.config.keep_states
+        self._touch = backend if isinstance(backend, SensesContacts) else None
+        self._force = backend if isinstance(backend, SensesForce) else None
+        keeps = self.config.keep_states and isinstance(backend, SavesStates)
+        self._saves = backend if keeps and isinstance(backend, SavesStates) else None
+        self._judges = not missing_abilities(backend, task.observes)
         self._prepare()
 
     def _prepare(self) -> None:
-        state = self.task.initial_state(self.model, self.placement)
-        self.backend.reset(state)
-        self._controller.reset(state.q)
-        self._recorder = StepRecorder(self.backend, self.config.cameras)
-        self.gripper = state.commanded_gripper
+        self._recorder = StepRecorder(self.backend, self.model, self.config.cameras)
+        if isinstance(self.backend, Resets):
+            state = self.task.initial_state(self.model, self.placement)
+            self.backend.reset(state)
+            self._controller.reset(state.q)
+            self.gripper = state.commanded_gripper
+        else:
+            here = self.backend.observe()
+            self._controller.reset(here.q)
+            self.gripper = float(np.clip(here.gripper, 0.0, 1.0))
         self._now = self._recorder.add(self._controller, self.gripper, self._no_force())
-        self._states = [self.backend.save()] if self._keeps else []
-        self._success, self._raw = [self.task.success(self._now)], list[Array]()
+        self._states = [self._saves.save()] if self._saves is not None else []
+        self.judged_by: Judge = "task" if self._judges else "nobody"
+        self._success, self._raw = [self._reached()], list[Array]()
         self._touching: list[tuple[tuple[str, str], ...]] = [()]
-        self._felt: list[Contact] = []
+        self._touched: set[tuple[str, str]] = set()
+        self._pressed = self._no_force()
         self.state, self.end = SessionState.READY, End.STOPPED
         self.trouble, self.contacts = "", list[Contact]()
 
     def _no_force(self) -> float:
-        return 0.0 if self._feels else np.nan
+        return np.nan if self._force is None else 0.0
+
+    def _reached(self) -> bool:
+        return self._judges and self.task.success(self._now)
 
     # --- what a person sees ---------------------------------------------------------------------
 
@@ -205,13 +230,13 @@ class TeleopSession:
 
     @property
     def steps(self) -> int:
-        """How many 10 Hz steps are recorded, the start among them."""
+        """How many steps are recorded, the start among them."""
         return len(self._success)
 
     @property
     def seconds(self) -> float:
         """How long the recording is by now [s]."""
-        return len(self._raw) / CONTROL_HZ
+        return len(self._raw) / self.backend.rates.control_hz
 
     @property
     def seconds_spent(self) -> float:
@@ -229,12 +254,24 @@ class TeleopSession:
     def success_held(self) -> float:
         """For how long [s] up to now the goal has been reached at every step."""
         misses = [t for t, reached in enumerate(self._success) if not reached]
-        return (len(self._success) - 1 - (misses[-1] if misses else -1)) / RECORD_HZ
+        return (len(self._success) - 1 - (misses[-1] if misses else -1)) / self._record_hz
 
     @property
     def achieved(self) -> bool:
         """Whether what is recorded counts as a success of the task."""
-        return self.task.achieved(np.array(self._success))
+        return self.task.achieved(np.array(self._success), self._record_hz)
+
+    @property
+    def failure_reason(self) -> str:
+        """Why the goal isn't reached now, in a few words."""
+        if self._judges:
+            return self.task.failure_reason(self._now)
+        lacking = ", ".join(missing_abilities(self.backend, self.task.observes))
+        return f"backend {self.backend.name!r} can't tell, for want of {lacking}"
+
+    @property
+    def _record_hz(self) -> int:
+        return self.backend.rates.record_hz
 
     # --- what a person does ---------------------------------------------------------------------
 
@@ -274,16 +311,33 @@ class TeleopSession:
         self._prepare()
 
     def stop(self) -> None:
-        """End the recording, the robot still to the end of a 10 Hz step.
+        """End the recording, the robot still to the end of a recorded step.
 
         Raises:
             InvalidInput: nothing is being recorded.
         """
         self._expect("stop", SessionState.RECORDING, SessionState.PAUSED)
         self._step(np.zeros(6), self.gripper)
-        while len(self._raw) % CONTROL_PER_RECORD:
+        while len(self._raw) % self.backend.rates.control_per_record:
             self._step(np.zeros(6), self.gripper)
         self._end(End.STOPPED)
+
+    def say_reached(self) -> None:
+        """Take a person's word that the goal was reached, where the backend can't tell.
+
+        It counts as reached for the task's `hold` up to the end.
+
+        Raises:
+            InvalidInput: the recording hasn't ended, or the task itself has judged it.
+        """
+        self._expect("say_reached", SessionState.ENDED)
+        if self._judges:
+            raise InvalidInput(
+                "say_reached: this backend tells by itself whether the goal is reached"
+            )
+        held = min(len(self._success), max(1, round(self.task.hold * self._record_hz)))
+        self._success[-held:] = [True] * held
+        self.judged_by = "person"
 
     def mark_saved(self) -> None:
         """Note that the ended recording is safe.
@@ -295,7 +349,7 @@ class TeleopSession:
         self.state = SessionState.SAVED
 
     def advance(self, command: TeleopCommand) -> None:
-        """Carry a command out for one control period, 1/30 s; every third one ends a 10 Hz step.
+        """Carry a command out for one control period; the last of a recorded step ends that.
 
         A command that leads out of reach is not carried out: the tool stays where it is, and
         `trouble` says why.
@@ -308,11 +362,11 @@ class TeleopSession:
             self.stop()
             return
         self._step(command.velocity, command.gripper)
-        if len(self._raw) % CONTROL_PER_RECORD:
+        if len(self._raw) % self.backend.rates.control_per_record:
             return
         if self.config.end_on_success and self.achieved:
             self._end(End.SUCCESS)
-        elif len(self._success) > self.config.max_seconds * RECORD_HZ:
+        elif len(self._success) > self.config.max_seconds * self._record_hz:
             self._end(End.TIME)
 
     def _expect(self, what: str, *states: SessionState) -> None:
@@ -329,29 +383,34 @@ class TeleopSession:
     # --- one control period ---------------------------------------------------------------------
 
     def _step(self, velocity: Array, gripper: float) -> None:
-        """Steer for one control period and measure; every third one is recorded."""
-        self.gripper = gripper
+        """Steer for one control period and measure; the last of a recorded step is recorded."""
         self._raw.append(np.append(velocity, gripper))
-        self.backend.command(self._steered(velocity), gripper)
+        sent = self.backend.command(self._steered(velocity), gripper)
+        self._controller.acknowledge(sent.q)
+        self.gripper = sent.gripper
         self.backend.step()
-        felt = self.backend.contacts() if self._feels else []
-        self._felt += felt
-        self.contacts = self._outer(felt)
-        if len(self._raw) % CONTROL_PER_RECORD:
+        if self._touch is not None:
+            touching = self._touch.contacts()
+            self._touched |= {(contact.a, contact.b) for contact in touching}
+            self.contacts = self._outer(touching)
+        if self._force is not None:
+            self._pressed = max(self._pressed, self._force.force())
+        if len(self._raw) % self.backend.rates.control_per_record:
             self._now = self.backend.observe()
             return
-        force = max([self._no_force(), *(contact.force for contact in self._felt)])
-        self._now = self._recorder.add(self._controller, gripper, force)
-        self._touching.append(tuple(sorted({(contact.a, contact.b) for contact in self._felt})))
-        self._felt = []
-        if self._keeps:
-            self._states.append(self.backend.save())
-        self._success.append(self.task.success(self._now))
+        self._now = self._recorder.add(self._controller, self.gripper, self._pressed)
+        self._touching.append(tuple(sorted(self._touched)))
+        self._touched, self._pressed = set(), self._no_force()
+        if self._saves is not None:
+            self._states.append(self._saves.save())
+        self._success.append(self._reached())
 
     def _steered(self, velocity: Array) -> Array:
         """Joint targets `(n,)` after one control period of a tool velocity; else stay, and say."""
         controller = self._controller
-        desired = apply_motion(controller.commanded_T_world_tool, velocity / CONTROL_HZ)
+        desired = apply_motion(
+            controller.commanded_T_world_tool, velocity / self.backend.rates.control_hz
+        )
         try:
             targets = controller.move(desired, self._now.T_world_tool, 1)[0]
         except (Unreachable, MotionRejected) as error:
@@ -402,7 +461,7 @@ class TeleopSession:
             robot=self.model.spec.name,
             backend=self.backend.name,
             steps=steps,
-            timestamps=np.arange(len(steps)) / RECORD_HZ,
+            timestamps=np.arange(len(steps)) / self._record_hz,
             body_Ts_world={
                 name: np.stack([row.Ts_world_body[name] for row in rows])
                 for name in rows[0].Ts_world_body
@@ -416,6 +475,8 @@ class TeleopSession:
             seconds=seconds,
             seed=seed,
             versions=library_versions(),
+            rates=self.backend.rates,
+            judged_by=self.judged_by,
         )
 
 
@@ -446,6 +507,8 @@ def record_demonstration(
 
     Raises:
         InvalidInput: the device did not stop within `max_seconds`.
+        UnknownName: there is no such camera.
+        MissingCapability: the backend takes no pictures.
     """
     session = TeleopSession(backend, task, model, placement, config)
     session.start()
@@ -454,10 +517,11 @@ def record_demonstration(
         session.advance(device.read(session.observation))
         if progress is not None and session.steps > steps:
             steps = session.steps
-            progress(steps / RECORD_HZ)
+            progress(steps / backend.rates.record_hz)
     if session.end is End.TIME:
         raise InvalidInput(
             f"the demonstration did not end within {session.config.max_seconds:g} s: "
-            f"{task.shortfall(session.observation)}; steer on, or allow more with max_seconds"
+            f"{session.failure_reason}; steer on, or allow more with max_seconds"
         )
-    return session.demonstration(device.operator, device.name, session.steps / RECORD_HZ, seed)
+    seconds = session.steps / backend.rates.record_hz
+    return session.demonstration(device.operator, device.name, seconds, seed)

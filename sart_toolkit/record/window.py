@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from sart_toolkit.data.records import CONTROL_HZ, Image
+from sart_toolkit.backends.interface import SensesContacts
+from sart_toolkit.data.records import Image
 from sart_toolkit.record.desk import FIRM, RecordingDesk, Tone
 from sart_toolkit.record.devices.manual import SPEEDS, Control
 from sart_toolkit.record.screen import (
@@ -63,9 +64,9 @@ class Pace:
     _MOST_BEHIND = 0.25
     _WINDOW = 1.0
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """The first period is due now."""
-        self._clock = clock
+    def __init__(self, hz: int, clock: Callable[[], float] = time.monotonic) -> None:
+        """The first of `hz` periods a second is due now."""
+        self._hz, self._clock = hz, clock
         self._next = self._since = clock()
         self._done = 0
         self.share = 1.0
@@ -74,11 +75,11 @@ class Pace:
         """How many control periods to carry out now."""
         now = self._clock()
         self._next = max(self._next, now - self._MOST_BEHIND)
-        n = max(0, int((now - self._next) * CONTROL_HZ) + (now >= self._next))
-        self._next += n / CONTROL_HZ
+        n = max(0, int((now - self._next) * self._hz) + (now >= self._next))
+        self._next += n / self._hz
         self._done += n
         if now - self._since >= self._WINDOW:
-            self.share = min(1.0, self._done / CONTROL_HZ / (now - self._since))
+            self.share = min(1.0, self._done / self._hz / (now - self._since))
             self._since, self._done = now, 0
         return n
 
@@ -104,7 +105,7 @@ class RecordingWindow:
         self._scene: Image | None = None
         self._drawn: tuple[int, float] | None = None
         self._size = 2
-        self._pace = Pace()
+        self._pace = Pace(desk.session.backend.rates.control_hz)
 
     def run(self) -> None:
         """Keep the recording going in real time until it is saved or discarded."""
@@ -124,7 +125,10 @@ class RecordingWindow:
                 self.draw()
                 ended = time.monotonic()
                 # A third of the time, at least, is left to the simulation.
-                again = max(ended + 0.5 * (ended - started), started + 1 / CONTROL_HZ)
+                again = max(
+                    ended + 0.5 * (ended - started),
+                    started + 1 / desk.session.backend.rates.control_hz,
+                )
             time.sleep(min(self._pace.left(), max(0.0, again - time.monotonic())))
 
     def _take(self, event: Key | Closed | FocusLost) -> None:
@@ -189,11 +193,10 @@ class RecordingWindow:
     def _wrist_and_settings(self) -> None:
         screen, desk = self._screen, self._desk
         session, device = desk.session, desk.device
-        screen.picture(
-            (800, 140, 280, 280), session.recorded.cameras[session.config.cameras[0]].rgb
-        )
-        screen.box((806, 394, 96, 20), BACKGROUND, radius=4)
-        screen.text((812, 395), "wrist camera", 13, FAINT)
+        camera = session.config.cameras[0]
+        screen.picture((800, 140, 280, 280), session.recorded.cameras[camera].rgb)
+        screen.box((806, 394, 20 + 8 * len(camera), 20), BACKGROUND, radius=4)
+        screen.text((812, 395), camera, 13, FAINT)
         left = 1096
         screen.text((left, 140), "Speed", 14, FAINT)
         for i, speed in enumerate(SPEEDS):
@@ -223,7 +226,7 @@ class RecordingWindow:
 
     def _force(self) -> None:
         screen, session = self._screen, self._desk.session
-        if not session.backend.capabilities.has_contacts:
+        if not isinstance(session.backend, SensesContacts):
             screen.text((800, 532), "this robot can't feel contact", 14, FAINT)
             return
         if not session.contacts:

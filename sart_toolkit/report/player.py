@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from sart_toolkit.backends.interface import Backend
+from sart_toolkit.backends.interface import Backend, Draws, require
 from sart_toolkit.collision.phases import demonstration_phases
-from sart_toolkit.data.records import RECORD_HZ, Demonstration, Episode, Image
+from sart_toolkit.data.records import Demonstration, Episode, Image
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import Array, check_positive, inverse
 from sart_toolkit.record.screen import (
@@ -82,7 +82,12 @@ class Playback:
     @property
     def seconds(self) -> float:
         """How long it lasts [s]."""
-        return (len(self) - 1) / RECORD_HZ
+        return (len(self) - 1) / self.hz
+
+    @property
+    def hz(self) -> int:
+        """Steps a second."""
+        return self.demonstration.rates.record_hz
 
     def waypoint(self, i: int) -> int:
         """The demonstration's waypoint at step `i`; in a segment, the one it joins."""
@@ -128,9 +133,11 @@ class SceneView:
         """Draw with a backend of the demonstration's robot and scene.
 
         Raises:
+            MissingCapability: the backend doesn't draw.
             UnknownName: no such camera in the scene.
             InvalidInput: where the bodies were wasn't recorded.
         """
+        self._stage = require(backend, Draws, "a recording is drawn from outside")
         if camera not in backend.cameras:
             known = {*backend.cameras, *playback.demonstration.steps.cameras}
             raise unknown_name("camera", camera, known)
@@ -144,33 +151,26 @@ class SceneView:
                 f"{playback.title}: doesn't tell where {missing[0]!r} was, so the scene can't be "
                 f"drawn; add --camera {playback.camera}"
             )
-        self._playback, self._backend, self._camera = playback, backend, camera
+        self._playback, self._scene, self._camera = playback, backend.scene, backend.cameras[camera]
         self._phases = demonstration_phases(playback.demonstration, backend.robot, backend.scene)
 
     def picture(self, i: int, size: int) -> Image:
         """The scene at step `i`, `(size, size, 3)` uint8."""
-        self._backend.reset(self._state(i))
-        return self._backend.observe((self._camera,), size).cameras[self._camera].rgb
+        return self._stage.draw(self._state(i), self._camera, size, size).rgb
 
     def _state(self, i: int) -> SceneState:
-        playback, scene = self._playback, self._backend.scene
+        playback, scene = self._playback, self._scene
         shown, t = playback.demonstration, playback.waypoint(i)
         Ts = {body.name: shown.body_Ts_world[body.name][t] for body in scene.bodies}
         q, T_world_tool = playback.joints(i)
         T_moved = T_world_tool @ inverse(shown.steps.measured_Ts_world_tool[t])
         for name in self._phases[t].grasped:
             Ts[name] = T_moved @ Ts[name]
-        joints = {name: scene.joint_position(name, Ts) for name in scene.jointed}
-        for name, body in scene.jointed.items():
-            assert body.joint is not None
-            joints[name] = float(np.clip(joints[name], body.joint.lower, body.joint.upper))
-        free = {name: T for name, T in Ts.items() if name not in joints}
-        gripper = float(np.clip(playback.gripper(i)[0], 0.0, 1.0))
-        return scene.initial_state(q, gripper, free, joints)
+        return scene.seen_state(q, playback.gripper(i)[0], Ts)
 
 
 def film(playback: Playback, scene: SceneView | None) -> Iterator[Image]:
-    """The frames of a film, one each 10 Hz step.
+    """The frames of a film, one each recorded step.
 
     Args:
         playback: what is shown.
@@ -179,7 +179,7 @@ def film(playback: Playback, scene: SceneView | None) -> Iterator[Image]:
     for i in range(len(playback)):
         picture = playback.picture(i)
         frame = picture if scene is None else inset(scene.picture(i, FILM_SIZE), picture)
-        yield strip(_large(frame), _facts(playback, i), i / RECORD_HZ)
+        yield strip(_large(frame), _facts(playback, i), i / playback.hz)
 
 
 def _large(frame: Image) -> Image:
@@ -223,7 +223,7 @@ class PlayWindow:
         Raises:
             InvalidInput: the speed is not positive.
         """
-        self._period = 1.0 / (RECORD_HZ * check_positive("speed", speed))
+        self._period = 1.0 / (playback.hz * check_positive("speed", speed))
         self._playback, self._scene, self._screen = playback, scene, screen
         self._speed, self._clock = speed, clock
         self._kept: OrderedDict[int, Image] = OrderedDict()
@@ -297,7 +297,7 @@ class PlayWindow:
         )
         screen.box((752, 76, 512, 52), CARD, edge=BLUE if self.playing else LINE)
         screen.text((768, 89), "playing" if self.playing else "stopped", 22, BRIGHT, bold=True)
-        screen.text((1250, 87), f"{i / RECORD_HZ:.1f} s", 24, BRIGHT, align="right")
+        screen.text((1250, 87), f"{i / playback.hz:.1f} s", 24, BRIGHT, align="right")
         screen.picture((752, 140, 320, 320), playback.picture(i))
         screen.box((758, 434, 20 + 8 * len(playback.camera), 20), BACKGROUND, radius=4)
         screen.text((764, 435), playback.camera, 13, FAINT)

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
-from sart_toolkit.data.records import RECORD_HZ, Image
+from sart_toolkit.data.records import Image
 from sart_toolkit.data.storage import replacing
 from sart_toolkit.errors import CannotWrite, InvalidInput, MissingExtra
 from sart_toolkit.poses import check_positive
@@ -159,12 +159,15 @@ def _ffmpeg() -> str:
         ) from error
 
 
-def film_rollout(path: Path, moments: Iterable[Moment], episode: int, outcome: Outcome) -> None:
+def film_rollout(
+    path: Path, moments: Iterable[Moment], hz: float, episode: int, outcome: Outcome
+) -> None:
     """Write a rollout's video: seen from outside, the wrist picture inset, a caption below.
 
     Args:
         path: the mp4 file.
-        moments: what the cameras saw, 10 times a second, at least one.
+        moments: what the cameras saw at each step, at least one.
+        hz: steps a second.
         episode: the rollout's number.
         outcome: how it ended.
 
@@ -182,7 +185,7 @@ def film_rollout(path: Path, moments: Iterable[Moment], episode: int, outcome: O
         )
         for moment in moments
     )
-    write_video(path, frames, RECORD_HZ)
+    write_video(path, frames, hz)
 
 
 # --- composing ----------------------------------------------------------------------------------

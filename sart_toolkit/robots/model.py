@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
+from sart_toolkit.data.records import CameraFrame
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable, unknown_name
 from sart_toolkit.poses import Array, check_array, check_pose, frozen
 from sart_toolkit.robots.spec import Attachment, RobotSpec, check_gripper
@@ -79,6 +80,17 @@ class RobotModel:
         if not self._model.existFrame(name):
             raise unknown_name("frame", name, [f.name for f in self._model.frames])
         return int(self._model.getFrameId(name))
+
+    def mount_of(self, frame: str) -> CameraFrame | None:
+        """What a frame (or "world") is rigid to: the tool, the world, or neither of them.
+
+        Raises:
+            UnknownName: no such frame.
+        """
+        joint = 0 if frame == "world" else self._model.frames[self._frame(frame)].parentJoint
+        if joint == self._model.frames[self._tool].parentJoint:
+            return "tool"
+        return "world" if joint == 0 else None
 
     def check_q(self, q: Array) -> Array:
         """A float64 copy of a joint configuration `(n,)`.

@@ -1,4 +1,4 @@
-"""A robot as data: which URDFs, how they join, where the tool frame and the wrist camera are."""
+"""A robot as data: which URDFs, how they join, where the tool frame and its cameras are."""
 
 from __future__ import annotations
 
@@ -144,6 +144,30 @@ class CameraSpec:
         return np.array([[f, 0, 0.5 * (width - 1)], [0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
 
 
+ImageSize = int | str | tuple[int, int]
+
+
+def check_image_size(value: ImageSize) -> tuple[int, int]:
+    """A picture's width and height [pixels].
+
+    Args:
+        value: (width, height), text such as "160x120", or one number for a square.
+
+    Raises:
+        InvalidInput: it is none of these, or has no pixel.
+    """
+    numbers = value.lower().split("x") if isinstance(value, str) else np.ravel(value).tolist()
+    try:
+        sizes = [int(str(number)) for number in numbers]
+    except ValueError:
+        sizes = []
+    if len(sizes) not in (1, 2) or min(sizes) < 1:
+        raise InvalidInput(
+            f"image_size: expected pixels, at least 1, as a number or WIDTHxHEIGHT, got {value!r}"
+        )
+    return sizes[0], sizes[-1]
+
+
 def look_at(p_camera: Array, p_target: Array, up: Array) -> Array:
     """The camera pose `(4, 4)` at `p_camera`, z axis through `p_target`, `up` upwards.
 
@@ -210,7 +234,8 @@ class RobotSpec:
     `urdf` is `package:path/inside/it` or a path. Joint arrays follow `arm_joints`:
     `home` [rad], `velocity_limits` [rad/s], `acceleration_limits` [rad/s²], `jerk_limits`
     [rad/s³] (a URDF has no such entries). `T_gripper_tool`: the tool frame in the gripper's base,
-    z pointing out between the fingertips, x along the direction in which they close.
+    z pointing out between the fingertips, x along the direction in which they close. `cameras` are
+    mounted on its frames; the one that policies see by is called "wrist" unless told otherwise.
     """
 
     name: str
@@ -223,7 +248,7 @@ class RobotSpec:
     gripper: GripperSpec
     gripper_base: str
     T_gripper_tool: Array
-    wrist_camera: CameraSpec
+    cameras: tuple[CameraSpec, ...] = ()
     attachments: tuple[Attachment, ...] = ()
     link_colours: Mapping[str, tuple[float, float, float, float]] = field(default_factory=dict)
     tool_frame: str = "tool"
@@ -236,6 +261,9 @@ class RobotSpec:
                 raise InvalidInput(f"{name}: expected numbers > 0, got {getattr(self, name)}")
         T = check_pose("T_gripper_tool", self.T_gripper_tool)
         object.__setattr__(self, "T_gripper_tool", frozen(T))
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) < len(names):
+            raise InvalidInput(f"cameras of {self.name}: expected different names, got {names}")
 
 
 def resource_path(resource: str) -> Path:

@@ -65,7 +65,7 @@ def ur5e_with(
         gripper=gripper,
         gripper_base=base,
         T_gripper_tool=T_gripper_tool,
-        wrist_camera=CameraSpec("wrist", base, T_gripper_camera, fov_y_deg=60.0),
+        cameras=(CameraSpec("wrist", base, T_gripper_camera, fov_y_deg=60.0),),
         attachments=(
             Attachment(
                 "wrist_camera",

@@ -62,7 +62,7 @@ def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
                 "faces": (_ARM_FACES, _GRIPPER_FACES),
                 "sources": [(str(p), p.stat().st_size, p.stat().st_mtime) for p in sources],
                 # Cameras are no part of a URDF: one that is moved a little needs no new one.
-                "spec": {k: v for k, v in _plain(spec).items() if k != "wrist_camera"},
+                "spec": {k: v for k, v in _plain(spec).items() if k != "cameras"},
                 "attachments": _plain(attachments),
             },
             sort_keys=True,

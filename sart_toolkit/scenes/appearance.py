@@ -65,9 +65,9 @@ def vary_appearance(
         intensity=scene.light.intensity * (1 + rng.uniform(-config.light, config.light)),
         ambient=scene.light.ambient * (1 + rng.uniform(-config.ambient, config.ambient)),
     )
-    camera = _remounted(robot.wrist_camera, rng, config)
+    cameras = tuple(_remounted(camera, rng, config) for camera in robot.cameras)
     return (
-        dataclasses.replace(robot, wrist_camera=camera),
+        dataclasses.replace(robot, cameras=cameras),
         dataclasses.replace(scene, bodies=bodies, light=light),
     )
 

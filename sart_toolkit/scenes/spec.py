@@ -232,6 +232,30 @@ class SceneSpec:
             poses[name] = poses[body.joint.parent] @ body.joint.T_parent_moved(positions[name])
         return SceneState(q, gripper, poses, positions, gripper_target)
 
+    def seen_state(
+        self, q: Array, gripper: float, Ts_world_body: Mapping[str, Array]
+    ) -> SceneState:
+        """The state with the robot and all bodies where they were measured.
+
+        Args:
+            q: robot joints `(n,)` [rad].
+            gripper: where the gripper is; a measured one may be a little outside [0, 1].
+            Ts_world_body: poses `(4, 4)` of at least the scene's bodies.
+
+        Raises:
+            UnknownName: a body's pose is missing.
+        """
+        for body in self.bodies:
+            if body.name not in Ts_world_body:
+                raise unknown_name("body", body.name, Ts_world_body)
+        joints = {}
+        for name, body in self.jointed.items():
+            assert body.joint is not None
+            at = self.joint_position(name, Ts_world_body)
+            joints[name] = float(np.clip(at, body.joint.lower, body.joint.upper))
+        free = {b.name: Ts_world_body[b.name] for b in self.bodies if b.joint is None}
+        return self.initial_state(q, float(np.clip(gripper, 0.0, 1.0)), free, joints)
+
     def joint_position(self, name: str, Ts_world_body: Mapping[str, Array]) -> float:
         """The position [rad or m] of the joint that body `name` moves on, from all bodies' poses.
 

@@ -105,7 +105,7 @@ class BottlePlacing(Task):
         stands = np.linalg.norm(bottom[:2]) < MAX_OFFSET and bottom[2] < MAX_HEIGHT
         return bool(stands and tilt_deg < MAX_TILT_DEG and opening > MIN_OPENING)
 
-    def shortfall(self, observation: Observation) -> str:
+    def failure_reason(self, observation: Observation) -> str:
         bottom, tilt_deg, opening = self._measured(observation)
         beside, above = np.linalg.norm(bottom[:2]) * 1e3, bottom[2] * 1e3
         if tilt_deg >= MAX_TILT_DEG:

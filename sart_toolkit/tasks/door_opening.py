@@ -130,7 +130,7 @@ class DoorOpening(Task):
     def success(self, observation: Observation) -> bool:
         return self._opened_deg(observation) >= OPEN_DEG
 
-    def shortfall(self, observation: Observation) -> str:
+    def failure_reason(self, observation: Observation) -> str:
         return f"door open by {self._opened_deg(observation):.0f} of {OPEN_DEG:.0f} deg"
 
     def plan(self, state: SceneState) -> list[Stage]:

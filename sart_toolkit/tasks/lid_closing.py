@@ -105,7 +105,7 @@ class LidClosing(Task):
         angle_deg, above = self._measured(observation)
         return bool(angle_deg < SHUT_DEG and above > LET_GO)
 
-    def shortfall(self, observation: Observation) -> str:
+    def failure_reason(self, observation: Observation) -> str:
         angle_deg, above = self._measured(observation)
         if angle_deg >= SHUT_DEG:
             return f"lid {angle_deg:.0f} deg open"

@@ -144,7 +144,7 @@ class LidOpening(Task):
     def success(self, observation: Observation) -> bool:
         return self._opened_deg(observation) > OPEN_DEG
 
-    def shortfall(self, observation: Observation) -> str:
+    def failure_reason(self, observation: Observation) -> str:
         return f"lid open by {self._opened_deg(observation):.0f} of {OPEN_DEG:.0f} deg"
 
     def plan(self, state: SceneState) -> list[Stage]:

@@ -103,7 +103,7 @@ class PegInHole(Task):
         inside = np.abs(tip[:2]).max() < 0.012
         return bool(inside and tip[2] < -HOLE_DEPTH / 2 and tilt < np.deg2rad(10))
 
-    def shortfall(self, observation: Observation) -> str:
+    def failure_reason(self, observation: Observation) -> str:
         tip, tilt = self._peg_in_hole(observation)
         if np.rad2deg(tilt) >= 10:
             return f"peg tilted {np.rad2deg(tilt):.0f} deg"

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sart_toolkit.backends.interface import Observation
-from sart_toolkit.data.records import RECORD_HZ
+from sart_toolkit.backends.interface import KnowsBodies, Observation
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.robots.model import RobotModel
@@ -85,6 +85,7 @@ class Task(abc.ABC):
         horizon: longest rollout [s].
         hold: how long [s] success must last before a rollout ends early.
         report_body: the body whose placement varies.
+        observes: the abilities that a backend must have for `success` and `failure_reason`.
     """
 
     name: str
@@ -95,6 +96,7 @@ class Task(abc.ABC):
     horizon: float
     hold: float = 1.0
     report_body: str
+    observes: tuple[type, ...] = (KnowsBodies,)
 
     @abc.abstractmethod
     def initial_state(self, model: RobotModel, placement: Placement) -> SceneState:
@@ -102,23 +104,26 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def success(self, observation: Observation) -> bool:
-        """Whether the goal is reached now, measured from the simulated bodies."""
+        """Whether the goal is reached now, by what a backend that has `observes` measures."""
 
     @abc.abstractmethod
-    def shortfall(self, observation: Observation) -> str:
+    def failure_reason(self, observation: Observation) -> str:
         """Why the goal isn't reached now, in a few words with numbers."""
 
     @abc.abstractmethod
     def plan(self, state: SceneState) -> list[Stage]:
         """The legs by which a person would steer the tool from the start to the goal."""
 
-    def achieved(self, success: NDArray[np.bool_]) -> bool:
+    def achieved(
+        self, success: NDArray[np.bool_], record_hz: int = DEFAULT_RATES.record_hz
+    ) -> bool:
         """Whether the goal was reached at the end and had been for `hold` seconds.
 
         Args:
-            success: `(T,)`, whether it was reached at each 10 Hz step.
+            success: `(T,)`, whether it was reached at each recorded step.
+            record_hz: recorded steps a second.
         """
-        return bool(np.all(success[-max(1, round(self.hold * RECORD_HZ)) :]))
+        return bool(np.all(success[-max(1, round(self.hold * record_hz)) :]))
 
     def sample_placement(self, rng: np.random.Generator, yaw_deg: float = 0.0) -> Placement:
         """A placement drawn uniformly from the square of half width `placement_range`.

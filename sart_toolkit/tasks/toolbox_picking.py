@@ -78,7 +78,7 @@ class ToolboxPicking(Task):
         in_fingers = (np.abs(p_tool_bar) < _IN_FINGERS).all()
         return bool(height > LIFT and tilt_deg < TILT_DEG and in_fingers)
 
-    def shortfall(self, observation: Observation) -> str:
+    def failure_reason(self, observation: Observation) -> str:
         height, tilt_deg, p_tool_bar = self._measured(observation)
         if tilt_deg >= TILT_DEG:
             return f"toolbox tilted {tilt_deg:.0f} deg"

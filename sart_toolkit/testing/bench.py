@@ -15,15 +15,25 @@ import coal
 import numpy as np
 
 from sart_toolkit.backends import BACKENDS
-from sart_toolkit.backends.interface import Backend, Contact, Observation
+from sart_toolkit.backends.interface import (
+    Backend,
+    Contact,
+    Draws,
+    KnowsBodies,
+    Observation,
+    Resets,
+    SavesStates,
+    SensesContacts,
+    SensesForce,
+    require,
+)
 from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
-from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.errors import InvalidInput, MissingCapability, MissingExtra
 from sart_toolkit.poses import Array, interpolate, inverse, pose
 from sart_toolkit.registry import lookup
 from sart_toolkit.robots import ROBOTS
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.robots.spec import ImageSize, RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
 from sart_toolkit.testing.scenes import BLOCK_TOP, SCENES, STICK_TIP, ready_joints, site
 
@@ -33,6 +43,11 @@ except ImportError as error:
     raise MissingExtra("pytest is missing; pip install 'sart_toolkit[testing]'") from error
 
 GRIPPER = 0.5
+ABILITIES: tuple[type, ...] = (Resets, SavesStates, SensesForce, SensesContacts, KnowsBodies, Draws)
+# Without `Resets` the robot is driven: so far [rad] in a control period, and then so long [s].
+_STRIDE, _SETTLE = 0.02, 1.5
+_TESTED = "this is to be tested"
+_WORKS = "test_an_ability_that_a_backend_has_works"
 
 # A convex part of a finger: its link, shape, pose in the link, and which side of the tool it is on.
 _Part = tuple[str, coal.CollisionGeometry, Array, int]
@@ -93,39 +108,83 @@ class Bench:
     ready: Array
     q: Array
     gripper: float = GRIPPER
-    _found: dict[str, bool] = field(default_factory=dict)
+    _found: dict[Any, bool] = field(default_factory=dict)
 
     # --- what a test needs ----------------------------------------------------------------------
 
-    def needs(self, *capabilities: str) -> None:
-        """Skip the test where the backend lacks a capability."""
-        for capability in capabilities:
-            if not getattr(self.backend.capabilities, capability):
-                pytest.skip(f"backend {self.backend.name!r} declares {capability}=False")
-            self.relies_on(self.has(capability), "test_what_a_backend_declares_it_can_do_it_can")
+    def needs(self, *abilities: type) -> None:
+        """Skip the test where the backend lacks an ability."""
+        for ability in abilities:
+            if not isinstance(self.backend, ability):
+                pytest.skip(f"backend {self.backend.name!r} lacks {ability.__name__}")
+            if ability is Draws:
+                self.needs_pictures()
+            self.relies_on(self.has(ability), _WORKS)
 
-    def has(self, capability: str) -> bool:
-        """Whether the backend declares a capability and does have it."""
-        if capability not in self._found:
-            self._found[capability] = getattr(self.backend.capabilities, capability) and self.does(
-                capability
-            )
-        return self._found[capability]
+    def needs_pictures(self) -> None:
+        """Skip the test where the backend takes no pictures."""
+        if self.backend.no_pictures:
+            pytest.skip(f"backend {self.backend.name!r} lacks pictures: {self.backend.no_pictures}")
+        self.relies_on(self.takes_pictures(), "test_a_backend_takes_pictures_or_says_why_not")
 
-    def does(self, capability: str) -> bool:
-        """Whether the backend does what a capability says, whatever it declares."""
+    def has(self, ability: type) -> bool:
+        """Whether the backend has an ability that works."""
+        if ability not in self._found:
+            self._found[ability] = isinstance(self.backend, ability) and self.does(ability)
+        return self._found[ability]
+
+    def does(self, ability: type) -> bool:
+        """Whether an ability that the backend has works."""
         try:
-            if capability == "can_restore":
-                self.backend.restore(self.backend.save())
-            elif capability == "has_contacts":
-                self.backend.contacts()
-            elif capability == "renders":
-                self.backend.observe((self.backend.robot.wrist_camera.name,), 8)
-            else:
+            if ability is Resets:
+                self.resets.reset(self.state())
+            elif ability is SavesStates:
+                self.states.restore(self.states.save())
+            elif ability is SensesContacts:
+                self.contacts()
+            elif ability is SensesForce:
+                return bool(np.isfinite(require(self.backend, SensesForce, _TESTED).force()))
+            elif ability is KnowsBodies:
                 return bool(self.backend.observe().Ts_world_body)
+            elif ability is Draws:
+                self.stage.draw(self.state(), next(iter(self.backend.cameras.values())), 8, 8)
         except MissingCapability:
             return False
         return True
+
+    def takes_pictures(self) -> bool:
+        """Whether a picture comes back that was asked for."""
+        if "pictures" not in self._found:
+            name = next(iter(self.backend.cameras))
+            try:
+                self._found["pictures"] = name in self.see((name,), 8).cameras
+            except MissingCapability:
+                self._found["pictures"] = False
+        return self._found["pictures"]
+
+    @property
+    def resets(self) -> Resets:
+        """The backend as one that can be reset."""
+        return require(self.backend, Resets, _TESTED)
+
+    @property
+    def states(self) -> SavesStates:
+        """The backend as one that saves states."""
+        return require(self.backend, SavesStates, _TESTED)
+
+    @property
+    def stage(self) -> Draws:
+        """The backend as one that draws."""
+        return require(self.backend, Draws, _TESTED)
+
+    @property
+    def hz(self) -> int:
+        """Control periods a second."""
+        return self.backend.rates.control_hz
+
+    def contacts(self) -> list[Contact]:
+        """What touched during the last step."""
+        return require(self.backend, SensesContacts, _TESTED).contacts()
 
     def relies_on(self, holds: object, test: str) -> None:
         """Skip the test where it can't tell anything before another one passes."""
@@ -134,6 +193,7 @@ class Bench:
 
     def relies_on_repeating(self) -> None:
         """Skip the test where not even the same commands after the same reset do the same."""
+        self.needs(Resets)
         if "repeats" not in self._found:
             self.reset()
             first = self.continuation()
@@ -161,10 +221,22 @@ class Bench:
         return self.scene.initial_state(self.ready if q is None else q, gripper, **kwargs)
 
     def reset(self, q: Array | None = None, gripper: float = GRIPPER, **kwargs: Any) -> SceneState:
-        """Reset to `state` of the same arguments, which is returned."""
+        """Reset to `state` of the same arguments, which is returned.
+
+        A backend that can't be reset is driven there; it can't be where bodies are to be moved.
+        """
         state = self.state(q, gripper, **kwargs)
-        self.backend.reset(state)
-        self.q, self.gripper = np.array(state.q), state.commanded_gripper
+        if isinstance(self.backend, Resets):
+            self.resets.reset(state)
+            self.q, self.gripper = np.array(state.q), state.commanded_gripper
+        else:
+            if kwargs:
+                self.needs(Resets)
+            start = self.see().q
+            n = max(1, int(np.ceil(np.abs(state.q - start).max() / _STRIDE)))
+            for i in range(1, n + 1):
+                self.command(start + (i / n) * (state.q - start), state.commanded_gripper)
+            self.wait(_SETTLE)
         return state
 
     def command(self, q: Array, gripper: float | None = None, periods: int = 1) -> None:
@@ -177,10 +249,10 @@ class Bench:
 
     def wait(self, seconds: float) -> None:
         """Step without new commands."""
-        for _ in range(round(seconds * CONTROL_HZ)):
+        for _ in range(round(seconds * self.hz)):
             self.backend.step()
 
-    def see(self, cameras: Sequence[str] = (), size: int | None = None) -> Observation:
+    def see(self, cameras: Sequence[str] = (), size: ImageSize | None = None) -> Observation:
         """What the backend observes."""
         return self.backend.observe(cameras, size)
 
@@ -196,7 +268,7 @@ class Bench:
         found = []
         for i in range(periods):
             self.command(self.model.ik(interpolate(start, goal, (i + 1) / periods), self.q))
-            found.append(self.backend.contacts() if self.has("has_contacts") else [])
+            found.append(self.contacts() if self.has(SensesContacts) else [])
         return found
 
     def lower_stick(self, gap: float) -> list[list[Contact]]:
@@ -211,9 +283,9 @@ class Bench:
     # --- what is compared -----------------------------------------------------------------------
 
     def digest(self, pictures: bool = False) -> str:
-        """What is observed now but the time, to the bit; the wrist camera's picture if told."""
-        wrist = self.backend.robot.wrist_camera.name
-        return _digest(self.see((wrist,) if pictures and self.has("renders") else (), 32))
+        """What is observed now but the time, to the bit; the first camera's picture if told."""
+        shown = pictures and not self.backend.no_pictures and self.takes_pictures()
+        return _digest(self.see(tuple(self.backend.cameras)[:1] if shown else (), 32))
 
     def continuation(self, periods: int = 6) -> list[str]:
         """What is observed and touched, to the bit, while all joints move a little."""
@@ -221,7 +293,7 @@ class Bench:
         q = self.see().q
         for i in range(1, periods + 1):
             self.command(q + 0.004 * i * np.cos(np.arange(len(q))), GRIPPER + 0.01 * i)
-            touched = self.backend.contacts() if self.has("has_contacts") else []
+            touched = self.contacts() if self.has(SensesContacts) else []
             seen.append(f"{self.digest(pictures=i == periods)} {touched}")
         return seen
 
@@ -306,6 +378,6 @@ def continue_in_new_process(*words: str) -> None:
     """Print as JSON the continuation of a saved state: backend, robot and file are named."""
     backend_name, robot_name, path = words
     bench = make_bench(backend_name, robot_name)
-    bench.backend.restore(Path(path).read_bytes())
+    bench.states.restore(Path(path).read_bytes())
     sys.stdout.write("\n" + json.dumps(bench.continuation()))
     bench.backend.close()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from sart_toolkit.backends import BACKENDS
+from sart_toolkit.backends.interface import KnowsBodies, Resets, SensesContacts
 from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import ROBOTS
 from sart_toolkit.scenes.spec import SceneSpec
@@ -64,7 +65,7 @@ def bench(_in_scene: Callable[[str], Bench]) -> Bench:
 def loose(_in_scene: Callable[[str], Bench]) -> Bench:
     """A peg between the fingers and a brick, both free to move."""
     bench = _in_scene("loose")
-    bench.needs("has_contacts", "observes_bodies")
+    bench.needs(Resets, SensesContacts, KnowsBodies)
     return bench
 
 
@@ -72,7 +73,7 @@ def loose(_in_scene: Callable[[str], Bench]) -> Bench:
 def jointed(_in_scene: Callable[[str], Bench]) -> Bench:
     """Hinges and slides of all sorts."""
     bench = _in_scene("jointed")
-    bench.needs("has_contacts", "observes_bodies")
+    bench.needs(Resets, SensesContacts, KnowsBodies)
     return bench
 
 
@@ -80,7 +81,7 @@ def jointed(_in_scene: Callable[[str], Bench]) -> Bench:
 def view(_in_scene: Callable[[str], Bench]) -> Bench:
     """Things to see."""
     bench = _in_scene("view")
-    bench.needs("renders")
+    bench.needs_pictures()
     return bench
 
 

@@ -173,7 +173,7 @@ def view_scene(robot: RobotSpec) -> SceneSpec:
     where it looks along a wrong axis. The camera `nowhere` has nothing before it.
     """
     T = site(robot)
-    wrist = robot.wrist_camera
+    wrist = robot.cameras[0]
     ready = RobotModel(robot).fk(ready_joints(robot), wrist.frame) @ wrist.T_frame_camera
     ball = (ready @ [0, 0, 0.3, 1])[:3]
     outwards = np.array([*ball[:2], 0.0]) / np.linalg.norm(ball[:2])

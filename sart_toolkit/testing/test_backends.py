@@ -1,4 +1,4 @@
-"""A backend's capabilities, its instances, and what it refuses."""
+"""A backend's abilities, its instances, and what it refuses."""
 
 from __future__ import annotations
 
@@ -8,52 +8,75 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sart_toolkit.backends.interface import Capabilities
+from sart_toolkit.backends.interface import (
+    Draws,
+    KnowsBodies,
+    Resets,
+    SavesStates,
+    SensesContacts,
+)
+from sart_toolkit.data.records import Rates
 from sart_toolkit.errors import InvalidInput, MissingCapability, UnknownName
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.scenes.spec import Body, SceneSpec, SceneState
-from sart_toolkit.testing.bench import Bench, find_backend
+from sart_toolkit.testing.bench import ABILITIES, Bench, find_backend
 
 Make = Callable[..., Bench]
-_ABILITIES = ("can_restore", "has_contacts", "renders", "observes_bodies")
 
 
-def test_capabilities_are_known_before_connecting(target: tuple[str, str]) -> None:
-    """They are an attribute of the class, and so is its name."""
+def test_name_and_abilities_are_known_before_connecting(target: tuple[str, str]) -> None:
+    """They are the class's own."""
     backend = find_backend(target[0])
     assert isinstance(backend.name, str)
-    assert isinstance(backend.capabilities, Capabilities)
+    if issubclass(backend, SavesStates):
+        # Radii around a waypoint are not much larger.
+        assert 0.0 <= backend.drift <= 1e-3
+        assert 0.0 <= backend.drift_deg <= 0.2
 
 
-def test_the_declared_drift_is_small(bench: Bench) -> None:
-    """At most 1 mm and 0.2 deg: radii around a waypoint are not much larger."""
-    assert 0.0 <= bench.backend.capabilities.drift <= 1e-3
-    assert 0.0 <= bench.backend.capabilities.drift_deg <= 0.2
+def test_rates_are_those_asked_for(bench: Bench) -> None:
+    """A backend is made for rates, and keeps to them."""
+    rates = Rates(physics_hz=180, control_hz=60, record_hz=15)
+    start = bench.see().time
+    bench.wait(1 / bench.hz)
+    right = bench.see().time - start == pytest.approx(1 / bench.hz, abs=1e-9)
+    bench.relies_on(right, "test_a_step_advances_time_by_one_control_period")
+    made = find_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16, rates)
+    assert made.rates == rates
+    before = made.observe()
+    made.command(before.q, float(np.clip(before.gripper, 0, 1)))
+    made.step()
+    assert made.observe().time - before.time == pytest.approx(1 / 60, abs=1e-9)
+    made.close()
 
 
-@pytest.mark.parametrize("capability", _ABILITIES)
-def test_what_a_backend_declares_it_can_do_it_can(bench: Bench, capability: str) -> None:
-    """A declared capability that isn't there would be found out in the middle of a run."""
-    if getattr(bench.backend.capabilities, capability):
-        assert bench.does(capability)
+@pytest.mark.parametrize("ability", ABILITIES, ids=[ability.__name__ for ability in ABILITIES])
+def test_an_ability_that_a_backend_has_works(bench: Bench, ability: type) -> None:
+    """One that isn't there would be found out in the middle of a run."""
+    if ability is Draws and bench.backend.no_pictures:
+        pytest.skip(f"backend {bench.backend.name!r} lacks pictures: {bench.backend.no_pictures}")
+    if isinstance(bench.backend, ability):
+        assert bench.does(ability)
 
 
-@pytest.mark.parametrize("capability", _ABILITIES)
-def test_what_a_backend_declares_it_cannot_do_raises(bench: Bench, capability: str) -> None:
+def test_a_backend_takes_pictures_or_says_why_not(bench: Bench) -> None:
     """With MissingCapability: nothing is silently left out."""
-    if getattr(bench.backend.capabilities, capability):
+    if not bench.backend.no_pictures:
+        assert bench.takes_pictures()
         return
-    if capability == "observes_bodies":
-        assert not bench.see().Ts_world_body
+    with pytest.raises(MissingCapability, match="takes no pictures"):
+        bench.see((next(iter(bench.backend.cameras)),), 8)
+
+
+def test_the_bodies_observed_are_those_that_a_backend_knows(bench: Bench) -> None:
+    """All of the scene and all that is held; none where it knows of none."""
+    seen = bench.see().Ts_world_body
+    if not isinstance(bench.backend, KnowsBodies):
+        assert not seen
         return
-    attempts: dict[str, list[Callable[[], object]]] = {
-        "can_restore": [bench.backend.save, lambda: bench.backend.restore(b"")],
-        "has_contacts": [bench.backend.contacts],
-        "renders": [lambda: bench.see((bench.backend.robot.wrist_camera.name,), 8)],
-    }
-    for attempt in attempts[capability]:
-        with pytest.raises(MissingCapability, match=r"can't \w+"):
-            attempt()
+    bench.relies_on(bench.has(KnowsBodies), "test_an_ability_that_a_backend_has_works")
+    names = [body.name for body in bench.scene.bodies] + [body.name for body in bench.scene.held]
+    assert set(seen) == set(names)
 
 
 # --- instances ----------------------------------------------------------------------------------
@@ -77,7 +100,7 @@ def test_two_instances_are_independent(bench: Bench, another: Make) -> None:
         bench.backend.command(bench.ready + offset, bench.gripper + 0.01 * i)
         other.backend.command(other.ready - 0.05, 0.1)
         bench.backend.step()
-        touched = bench.backend.contacts() if bench.has("has_contacts") else []
+        touched = bench.contacts() if bench.has(SensesContacts) else []
         other.backend.step()
         seen.append(f"{bench.digest(pictures=i == 6)} {touched}")
     assert seen == expected
@@ -96,7 +119,8 @@ def test_closing_one_instance_leaves_others_alone(bench: Bench) -> None:
     """Neither the first close nor the second reaches somebody else's simulator."""
     make = find_backend(bench.backend_name)
     made, kept = (make(bench.backend.robot, bench.scene, 16) for _ in range(2))
-    kept.reset(bench.state())
+    if isinstance(kept, Resets):
+        kept.reset(bench.state())
     made.close()
     kept.step()
     assert np.isfinite(kept.observe().T_world_tool).all()
@@ -123,6 +147,8 @@ def test_a_bad_command_is_refused_and_changes_nothing(
     bench: Bench, q: Callable[[Array], Array], gripper: float
 ) -> None:
     """Not clipped to something else, and the last good command stays in force."""
+    with pytest.raises(InvalidInput):
+        bench.backend.command(q(bench.ready), gripper)
     bench.relies_on_repeating()
     bench.backend.command(bench.ready + 0.01, 0.6)
     bench.wait(0.1)
@@ -137,20 +163,22 @@ def test_a_bad_command_is_refused_and_changes_nothing(
 
 def test_a_state_with_impossible_joints_is_refused(bench: Bench) -> None:
     """Of the wrong number or outside their limits."""
+    bench.needs(Resets)
     for q in (bench.ready[:-1], bench.ready + 100.0):
         with pytest.raises(InvalidInput):
-            bench.backend.reset(bench.state(q))
+            bench.resets.reset(bench.state(q))
 
 
 def test_a_state_needs_exactly_the_bodies_of_the_scene(bench: Bench) -> None:
     """Neither one more nor one fewer."""
+    bench.needs(Resets)
     table, block = bench.scene.bodies
     more = SceneSpec((table, block, Body("cup", block.shapes)))
     with pytest.raises(UnknownName, match="'cup'"):
-        bench.backend.reset(more.initial_state(bench.ready, 0.5))
+        bench.resets.reset(more.initial_state(bench.ready, 0.5))
     fewer = SceneSpec((block,))
     with pytest.raises(UnknownName, match="'table'"):
-        bench.backend.reset(fewer.initial_state(bench.ready, 0.5))
+        bench.resets.reset(fewer.initial_state(bench.ready, 0.5))
 
 
 def _off_its_joint(state: SceneState) -> dict[str, Any]:
@@ -170,4 +198,4 @@ def test_a_state_with_a_body_off_its_joint_is_refused(
     state = jointed.state()
     values = {"Ts_world_body": state.Ts_world_body, "joint_positions": state.joint_positions}
     with pytest.raises(InvalidInput, match="'drawer'"):
-        jointed.backend.reset(SceneState(state.q, state.gripper, **{**values, **change(state)}))
+        jointed.resets.reset(SceneState(state.q, state.gripper, **{**values, **change(state)}))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sart_toolkit.data.records import CONTROL_HZ
+from sart_toolkit.backends.interface import SavesStates
 from sart_toolkit.poses import angle_between, pose
 from sart_toolkit.robots.spec import mass_properties
 from sart_toolkit.scenes.spec import Body, Joint
@@ -47,7 +47,7 @@ def test_a_reset_stops_free_bodies(loose: Bench) -> None:
     loose.wait(0.3)
     loose.reset(Ts_world_body=_lifted(loose, 0.5))
     top = _brick(loose)[2, 3]
-    loose.wait(1 / CONTROL_HZ)
+    loose.wait(1 / loose.hz)
     assert top - _brick(loose)[2, 3] < 0.02
 
 
@@ -76,25 +76,25 @@ def test_a_falling_body_lands_on_what_is_below(loose: Bench) -> None:
 
 def test_restore_returns_free_bodies(loose: Bench) -> None:
     """Exactly, in their fall."""
-    loose.needs("can_restore")
+    loose.needs(SavesStates)
     loose.reset(Ts_world_body=_lifted(loose, 0.3))
     loose.wait(0.1)
-    before, state = _brick(loose), loose.backend.save()
+    before, state = _brick(loose), loose.states.save()
     loose.wait(0.3)
-    loose.backend.restore(state)
+    loose.states.restore(state)
     np.testing.assert_array_equal(_brick(loose), before)
 
 
 def test_a_falling_body_goes_on_falling_after_a_restore(loose: Bench) -> None:
     """Velocities are part of the state."""
-    loose.needs("can_restore")
+    loose.needs(SavesStates)
     loose.reset(Ts_world_body=_lifted(loose, 0.5))
     loose.wait(0.2)
-    before, state = _brick(loose), loose.backend.save()
+    before, state = _brick(loose), loose.states.save()
     loose.wait(0.1)
     live = _brick(loose)
     loose.reset()
-    loose.backend.restore(state)
+    loose.states.restore(state)
     loose.relies_on((_brick(loose) == before).all(), "test_restore_returns_free_bodies")
     loose.wait(0.1)
     np.testing.assert_allclose(_brick(loose), live, rtol=0, atol=2e-3)
@@ -104,22 +104,22 @@ def test_a_second_after_a_restore_resting_bodies_are_where_they_would_have_been(
     loose: Bench,
 ) -> None:
     """Within the declared drift, all the time."""
-    loose.needs("can_restore")
+    loose.needs(SavesStates)
     loose.relies_on_repeating()
 
     def second() -> list[dict[str, np.ndarray]]:
         seen = []
-        for i in range(CONTROL_HZ):
+        for i in range(loose.hz):
             loose.command(loose.ready + 0.002 * i)
             seen.append(dict(loose.see().Ts_world_body))
         return seen
 
     loose.wait(0.5)
-    before, state = _brick(loose), loose.backend.save()
+    before, state = _brick(loose), loose.states.save()
     live = second()
-    loose.backend.restore(state)
+    loose.states.restore(state)
     loose.relies_on((_brick(loose) == before).all(), "test_restore_returns_free_bodies")
-    declared = loose.backend.capabilities
+    declared = loose.states
     for Ts_live, Ts in zip(live, second(), strict=True):
         for name in ("peg", "brick"):
             T, T_live = Ts[name], Ts_live[name]
@@ -143,16 +143,16 @@ def test_what_happens_to_free_bodies_after_a_restore_depends_on_the_saved_state_
     loose: Bench,
 ) -> None:
     """To the bit: a bouncing brick bounces in the same way each time."""
-    loose.needs("can_restore")
+    loose.needs(SavesStates)
     loose.relies_on_repeating()
     loose.reset(Ts_world_body=_lifted(loose, 0.05))
     loose.wait(0.1)
-    before, state = _brick(loose), loose.backend.save()
+    before, state = _brick(loose), loose.states.save()
     seen = []
     histories: tuple[Callable[[], object], ...] = (lambda: loose.wait(0.3), loose.reset)
     for between in histories:
         between()
-        loose.backend.restore(state)
+        loose.states.restore(state)
         loose.relies_on((_brick(loose) == before).all(), "test_restore_returns_free_bodies")
         seen.append(loose.continuation(12))
     assert seen[1] == seen[0]
@@ -165,8 +165,8 @@ def _path(bench: Bench, name: str, start: float, seconds: float) -> np.ndarray:
     """The positions of a joint that starts at rest, at each control period, the first included."""
     bench.reset(bench.ready, joint_positions={name: start})
     found = [bench.positions()[name]]
-    for _ in range(round(seconds * CONTROL_HZ)):
-        bench.wait(1 / CONTROL_HZ)
+    for _ in range(round(seconds * bench.hz)):
+        bench.wait(1 / bench.hz)
         found.append(bench.positions()[name])
     return np.array(found)
 
@@ -235,7 +235,7 @@ def test_a_spring_pulls_with_its_stiffness(jointed: Bench, kind: str) -> None:
     assert (path >= 0).any(), "it never comes to the rest position"
     after = int(np.argmax(path >= 0))
     crossed = after - path[after] / (path[after] - path[after - 1])
-    assert crossed / CONTROL_HZ == pytest.approx(quarter, rel=0.1)
+    assert crossed / jointed.hz == pytest.approx(quarter, rel=0.1)
 
 
 @kinds
@@ -271,23 +271,23 @@ def test_the_tool_pushes_a_jointed_body(jointed: Bench) -> None:
 
 def test_restore_returns_jointed_bodies(jointed: Bench) -> None:
     """Exactly, in their swing."""
-    jointed.needs("can_restore")
+    jointed.needs(SavesStates)
     jointed.wait(0.2)
-    before, state = jointed.positions(), jointed.backend.save()
+    before, state = jointed.positions(), jointed.states.save()
     jointed.wait(0.3)
-    jointed.backend.restore(state)
+    jointed.states.restore(state)
     assert jointed.positions() == before
 
 
 def test_a_swinging_body_goes_on_swinging_after_a_restore(jointed: Bench) -> None:
     """Joint velocities are part of the state."""
-    jointed.needs("can_restore")
+    jointed.needs(SavesStates)
     jointed.wait(0.3)
-    before, state = jointed.positions(), jointed.backend.save()
+    before, state = jointed.positions(), jointed.states.save()
     jointed.wait(0.1)
     live = jointed.positions()
     jointed.reset()
-    jointed.backend.restore(state)
+    jointed.states.restore(state)
     jointed.relies_on(jointed.positions() == before, "test_restore_returns_jointed_bodies")
     jointed.wait(0.1)
     assert jointed.positions() == pytest.approx(live, abs=0.005)

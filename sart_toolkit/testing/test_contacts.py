@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sart_toolkit.backends.interface import Contact
+from sart_toolkit.backends.interface import Contact, Resets, SavesStates, SensesContacts
 from sart_toolkit.collision.model import CollisionModel
 from sart_toolkit.poses import pose
 from sart_toolkit.testing.bench import Bench
@@ -17,7 +17,7 @@ _STICK_ON_BLOCK = ("block", "stick")
 @pytest.fixture
 def touch(bench: Bench) -> Bench:
     """The plain scene on a backend that reports contacts."""
-    bench.needs("has_contacts")
+    bench.needs(SensesContacts)
     return bench
 
 
@@ -49,7 +49,7 @@ def test_contact_is_reported_when_bodies_touch(touch: Bench) -> None:
     # A stiff arm on a stiff block may bounce.
     for _ in range(10):
         touch.backend.step()
-        steps.append(touch.backend.contacts())
+        steps.append(touch.contacts())
     assert any(_force(contacts, _STICK_ON_BLOCK) > 1.0 for contacts in steps[-12:])
 
 
@@ -63,31 +63,30 @@ def test_contacts_are_those_of_the_last_step(touch: Bench) -> None:
     """Not all since the reset."""
     touch.lower_stick(-0.002)
     touch.lower_stick(0.05)
-    assert _STICK_ON_BLOCK not in _pairs(touch.backend.contacts())
+    assert _STICK_ON_BLOCK not in _pairs(touch.contacts())
 
 
 def test_nothing_has_touched_after_a_reset(touch: Bench) -> None:
     """Contacts are those of the last step, and there was none."""
+    touch.needs(Resets)
     touch.lower_stick(-0.002)
     touch.reset()
-    assert touch.backend.contacts() == []
+    assert touch.contacts() == []
 
 
 def test_nothing_has_touched_after_a_restore(touch: Bench) -> None:
     """Even if the state was saved in contact."""
-    touch.needs("can_restore")
+    touch.needs(SavesStates)
     touch.lower_stick(-0.002)
-    touch.backend.restore(touch.backend.save())
-    assert touch.backend.contacts() == []
+    touch.states.restore(touch.states.save())
+    assert touch.contacts() == []
 
 
 def test_contacts_agree_with_the_geometry(touch: Bench) -> None:
     """Anywhere: with the scene, and of the tool with the arm."""
     touch.relies_on_contacts()
     touch.wait(0.1)
-    touch.relies_on(
-        not _moving(touch, touch.backend.contacts()), "test_nothing_touches_in_free_space"
-    )
+    touch.relies_on(not _moving(touch, touch.contacts()), "test_nothing_touches_in_free_space")
     model, n = touch.model, len(touch.ready)
     placed = CollisionModel(model.spec, touch.scene).placed(
         touch.state().Ts_world_body, touch.gripper
@@ -111,7 +110,7 @@ def test_contacts_agree_with_the_geometry(touch: Bench) -> None:
             continue
         touch.reset(q)
         touch.command(q)
-        touched = _moving(touch, touch.backend.contacts())
+        touched = _moving(touch, touch.contacts())
         assert bool(touched) == (nearest < 0), (nearest, touched)
         kinds.add(bool(touched))
     assert kinds == {False, True}
@@ -121,7 +120,7 @@ def test_contacts_are_in_order_of_their_names(touch: Bench, loose: Bench) -> Non
     """Within a pair and in the list, each pair once."""
     loose.reset(Ts_world_body={"brick": _brick_at_post(loose)})
     loose.wait(0.5)
-    pairs = _pairs(loose.backend.contacts())
+    pairs = _pairs(loose.contacts())
     touch.relies_on_contacts()
     assert all(a < b for a, b in pairs)
     assert pairs == sorted(set(pairs))
@@ -137,13 +136,13 @@ def test_a_free_body_touches_what_it_stands_on(touch: Bench, loose: Bench) -> No
     """Pairs of scene bodies count where one of them can move."""
     touch.relies_on_contacts()
     loose.wait(0.2)
-    assert {("brick", "table"), ("peg", "post")} <= set(_pairs(loose.backend.contacts()))
+    assert {("brick", "table"), ("peg", "post")} <= set(_pairs(loose.contacts()))
 
 
 def test_contact_forces_are_in_newtons(touch: Bench, loose: Bench) -> None:
     """A brick at rest presses with its weight."""
     loose.wait(1.0)
-    contacts = loose.backend.contacts()
+    contacts = loose.contacts()
     pair = ("brick", "table")
     loose.relies_on(pair in _pairs(contacts), "test_a_free_body_touches_what_it_stands_on")
     assert _force(contacts, pair) == pytest.approx(0.2 * 9.81, rel=0.3)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from sart_toolkit.data.records import CONTROL_HZ
+from sart_toolkit.backends.interface import KnowsBodies
 from sart_toolkit.poses import inverse
 from sart_toolkit.testing.bench import Bench
 from sart_toolkit.testing.scenes import GRASP_HEIGHT, GRASPED_WIDTH
@@ -24,7 +24,7 @@ def test_the_gripper_goes_where_commanded(bench: Bench) -> None:
 
 def test_the_fingers_are_as_far_apart_as_the_gripper_s_value_says(bench: Bench) -> None:
     """In metres, by the linkage of the robot's description, with every finger moving."""
-    bench.needs("observes_bodies")
+    bench.needs(KnowsBodies)
     for command in _COMMANDS:
         bench.command(bench.ready, command, 45)
         expected = bench.expected_opening(float(np.clip(bench.see().gripper, 0, 1)))
@@ -34,7 +34,7 @@ def test_the_fingers_are_as_far_apart_as_the_gripper_s_value_says(bench: Bench) 
 def test_the_gripper_moves_no_faster_than_its_speed(bench: Bench) -> None:
     """It takes its time, and is still on its way when the arm has moved on."""
     spec = bench.model.spec.gripper
-    per_period = spec.speed / spec.closed_position / CONTROL_HZ
+    per_period = spec.speed / spec.closed_position / bench.hz
     bench.reset(gripper=0.0)
     before = bench.see().gripper
     for _ in range(15):
@@ -80,7 +80,7 @@ def _grasp(bench: Bench) -> Grasp:
     bench.reset(bench.joints_at([0, 0, GRASP_HEIGHT]), 0.0)
     bench.command(bench.q, 1.0, 60)
     gripper, opening = bench.see().gripper, bench.finger_opening()
-    touching = [(c.a, c.b) for c in bench.backend.contacts()]
+    touching = [(c.a, c.b) for c in bench.contacts()]
     stood, in_tool = peg(), peg_in_tool()
     bench.move_tool([0, 0, GRASP_HEIGHT + 0.05], 30)
     bench.command(bench.q, periods=30)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sart_toolkit.data.records import CONTROL_HZ
+from sart_toolkit.backends.interface import KnowsBodies, Resets, SavesStates
 from sart_toolkit.testing.bench import Bench
 
 # Where a joint may be [rad] when it is where it was commanded to.
@@ -29,7 +29,7 @@ def test_joints_follow_at_the_commanded_speed(bench: Bench) -> None:
     speed = np.linspace(0.2, 0.8, len(bench.ready))
     late = []
     for i in range(1, 16):
-        bench.command(bench.ready + speed * i / CONTROL_HZ)
+        bench.command(bench.ready + speed * i / bench.hz)
         late.append(np.abs(bench.see().q - bench.q))
     bench.wait(0.3)
     arrived = np.abs(bench.see().q - bench.q) < _REACHED
@@ -37,14 +37,27 @@ def test_joints_follow_at_the_commanded_speed(bench: Bench) -> None:
     assert np.max(np.array(late)[:, arrived]) < 2 * _REACHED
 
 
+def test_a_command_returns_what_was_sent(bench: Bench) -> None:
+    """Where a robot goes no farther than it can in one step, it says so."""
+    last = np.eye(len(bench.ready))[-1]
+    for offset in (0.01, 0.1):
+        sent = bench.backend.command(bench.ready + offset * last, 0.6)
+        assert 0.0 <= sent.gripper <= 1.0
+        bench.wait(0.5)
+        arrived = np.abs(bench.see().q - sent.q) < _REACHED
+        if offset == 0.01:
+            bench.relies_on(arrived.all(), "test_commanded_joints_are_reached")
+        assert arrived.all()
+
+
 def test_joint_velocities_are_those_of_the_joints(bench: Bench) -> None:
     """In rad/s, with the sign of the motion."""
     speed = np.linspace(0.2, 0.8, len(bench.ready))
     for i in range(1, 16):
         before = bench.see().q
-        bench.command(bench.ready + speed * i / CONTROL_HZ)
+        bench.command(bench.ready + speed * i / bench.hz)
     seen = bench.see()
-    np.testing.assert_allclose(seen.dq, (seen.q - before) * CONTROL_HZ, rtol=0.02, atol=0.01)
+    np.testing.assert_allclose(seen.dq, (seen.q - before) * bench.hz, rtol=0.02, atol=0.01)
 
 
 def test_the_joint_path_leads_from_one_observation_to_the_next(bench: Bench) -> None:
@@ -55,7 +68,7 @@ def test_the_joint_path_leads_from_one_observation_to_the_next(bench: Bench) -> 
     speed = np.linspace(0.2, 0.8, len(bench.ready))
     for i in range(1, 16):
         before = bench.see().q
-        bench.command(bench.ready + speed * i / CONTROL_HZ)
+        bench.command(bench.ready + speed * i / bench.hz)
     seen = bench.see()
     path, n = seen.joint_path, len(seen.q)
     assert path.ndim == 2 and path.shape[1] == n
@@ -65,12 +78,13 @@ def test_the_joint_path_leads_from_one_observation_to_the_next(bench: Bench) -> 
         even = before + np.linspace(0, 1, len(path) + 1)[1:, None] * way
         # The backend's own clock may be off the control period by one row.
         assert (np.abs(path - even) <= np.abs(way) / len(path) + 1e-3).all()
-    if bench.has("can_restore"):
-        bench.backend.restore(bench.backend.save())
+    if bench.has(SavesStates):
+        bench.states.restore(bench.states.save())
         assert bench.see().joint_path.shape == (0, n)
-    bench.command(bench.ready)
-    bench.reset()
-    assert bench.see().joint_path.shape == (0, n)
+    if bench.has(Resets):
+        bench.command(bench.ready)
+        bench.reset()
+        assert bench.see().joint_path.shape == (0, n)
 
 
 def test_joints_stay_within_their_limits(bench: Bench) -> None:
@@ -105,7 +119,9 @@ def test_the_tool_is_where_kinematics_have_it(bench: Bench) -> None:
 
 def test_what_is_held_moves_rigidly_with_the_robot(bench: Bench) -> None:
     """A scene's attachments stand where their frame has them."""
-    bench.needs("observes_bodies")
+    bench.needs(KnowsBodies)
+    known = "test_the_bodies_observed_are_those_that_a_backend_knows"
+    bench.relies_on("stick" in bench.see().Ts_world_body, known)
     for offset in (0.0, 0.2):
         bench.reset(bench.ready + offset)
         bench.command(bench.q + 0.01)
@@ -115,10 +131,10 @@ def test_what_is_held_moves_rigidly_with_the_robot(bench: Bench) -> None:
 
 
 def test_a_step_advances_time_by_one_control_period(bench: Bench) -> None:
-    """By 1/30 s, exactly."""
-    times = []
-    for _ in range(2 * CONTROL_HZ):
+    """Exactly."""
+    start, times = bench.see().time, []
+    for _ in range(2 * bench.hz):
         bench.command(bench.ready)
         times.append(bench.see().time)
-    np.testing.assert_allclose(np.diff([0.0, *times]), 1 / CONTROL_HZ, rtol=0, atol=1e-12)
-    assert times[-1] == pytest.approx(2.0, abs=1e-12)
+    np.testing.assert_allclose(np.diff([start, *times]), 1 / bench.hz, rtol=0, atol=1e-12)
+    assert times[-1] - start == pytest.approx(2.0, abs=1e-12)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from sart_toolkit.backends.interface import CameraView
+from sart_toolkit.backends.interface import CameraView, Draws, Resets
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import Array, inverse, pose
+from sart_toolkit.robots.spec import ImageSize, check_image_size
+from sart_toolkit.scenes.spec import SceneState
 from sart_toolkit.testing.bench import Bench, find_backend
 from sart_toolkit.testing.scenes import DOT_OFFSET, DOT_THICKNESS, ROOM_HALF_WIDTH
 
@@ -16,10 +20,10 @@ _EXTRINSICS = "test_bodies_appear_where_the_camera_s_pose_has_them"
 
 
 def _wrist(bench: Bench) -> str:
-    return bench.backend.robot.wrist_camera.name
+    return bench.backend.robot.cameras[0].name
 
 
-def _take(bench: Bench, camera: str, size: int = _SIZE) -> CameraView:
+def _take(bench: Bench, camera: str, size: ImageSize = _SIZE) -> CameraView:
     return bench.see((camera,), size).cameras[camera]
 
 
@@ -71,19 +75,22 @@ def test_bodies_appear_where_the_camera_s_pose_has_them(view: Bench, camera: str
     assert _same_direction(bead, _projected(view, camera, "bead"), 8.0)
 
 
-@pytest.mark.parametrize("size", [64, 129])
-def test_bodies_appear_as_the_field_of_view_has_them(view: Bench, size: int) -> None:
+@pytest.mark.parametrize("size", [(64, 64), (129, 129), (160, 120), (112, 128)])
+def test_bodies_appear_as_the_field_of_view_has_them(view: Bench, size: tuple[int, int]) -> None:
     """Intrinsics: a square of dots is as large as it should be, its middle at the picture's.
 
-    `fov_y_deg` is the whole vertical angle, and (0, 0) the centre of the first pixel.
+    `fov_y_deg` is the whole vertical angle, pixels are square, and (0, 0) is the centre of the
+    first pixel.
     """
-    green, half = _coloured(_take(view, "room", size), "green"), size // 2
-    upper_left, lower_right = _middle(green[:half, :half]), _middle(green[-half:, -half:])
+    green = _coloured(_take(view, "room", size), "green")
+    u, v = (n // 2 for n in size)
+    upper_left, lower_right = _middle(green[:v, :u]), _middle(green[-v:, -u:])
     assert upper_left is not None and lower_right is not None, "the dots are not in the picture"
-    K = view.backend.cameras["room"].intrinsics(size, size)
+    K = view.backend.cameras["room"].intrinsics(*size)
     offset = K[0, 0] * DOT_OFFSET / (ROOM_HALF_WIDTH - DOT_THICKNESS)
+    lower_right = lower_right + np.subtract(size, (u, v))
     np.testing.assert_allclose(upper_left, K[:2, 2] - offset, rtol=0, atol=0.6)
-    np.testing.assert_allclose(lower_right + (size - half), K[:2, 2] + offset, rtol=0, atol=0.6)
+    np.testing.assert_allclose(lower_right, K[:2, 2] + offset, rtol=0, atol=0.6)
 
 
 def test_depth_is_in_metres(view: Bench) -> None:
@@ -125,11 +132,11 @@ def test_colours_are_red_green_and_blue_in_order(view: Bench) -> None:
 
 def test_pictures_have_the_size_asked_for(view: Bench) -> None:
     """Or else the backend's own."""
-    for size in (1, 33, None):
+    for size in (1, 33, (16, 9), None):
         picture = view.see((_wrist(view),), size).cameras[_wrist(view)]
-        n = size or view.backend.image_size
-        assert picture.rgb.shape == (n, n, 3)
-        assert picture.depth.shape == (n, n)
+        width, height = check_image_size(size or view.backend.image_size)
+        assert picture.rgb.shape == (height, width, 3)
+        assert picture.depth.shape == (height, width)
 
 
 def test_pictures_have_bytes_for_colours_and_float32_for_depth(view: Bench) -> None:
@@ -183,6 +190,62 @@ def test_pictures_show_bodies_where_they_are_now(view: Bench) -> None:
     view.reset(Ts_world_body={"ball": place})
     ball = _from_middle(_take(view, "left"), "green")
     assert ball is not None and ball[0] > 5 and abs(ball[1]) < 1.5
+
+
+# --- drawn --------------------------------------------------------------------------------------
+
+
+def _moved_ball(bench: Bench) -> SceneState:
+    """A state with the arm and the ball out of their places."""
+    camera = bench.backend.cameras["left"].T_frame_camera
+    place = bench.state().Ts_world_body["ball"].copy()
+    place[:3, 3] += 0.05 * camera[:3, 0]
+    return bench.state(bench.ready + 0.1, Ts_world_body={"ball": place})
+
+
+def test_a_drawn_state_looks_like_the_state(view: Bench) -> None:
+    """As a picture of the same state after a reset does."""
+    view.needs(Draws, Resets)
+    state = _moved_ball(view)
+    for name in ("left", _wrist(view)):
+        drawn = view.stage.draw(state, view.backend.cameras[name], 96, 64)
+        view.resets.reset(state)
+        taken = _take(view, name, (96, 64))
+        view.reset()
+        np.testing.assert_allclose(drawn.T_world_camera, taken.T_world_camera, rtol=0, atol=1e-4)
+        different = np.abs(drawn.rgb.astype(int) - taken.rgb).max(-1) > 8
+        assert different.mean() < 0.01
+        np.testing.assert_array_equal(drawn.depth > 0, taken.depth > 0)
+
+
+def test_a_drawing_camera_need_not_be_one_of_the_scene_s(view: Bench) -> None:
+    """Any pose and field of view will do, also under a name that is taken."""
+    view.needs(Draws)
+    left = view.backend.cameras["left"]
+    for fov in (left.fov_y_deg, 0.5 * left.fov_y_deg):
+        camera = dataclasses.replace(left, fov_y_deg=fov)
+        drawn = view.stage.draw(view.state(), camera, _SIZE, _SIZE)
+        bead = _from_middle(drawn, "magenta")
+        view.relies_on(bead is not None, _EXTRINSICS)
+        T_camera_world = inverse(left.T_frame_camera)
+        p = T_camera_world @ view.state().Ts_world_body["bead"][:, 3]
+        expected = camera.intrinsics(_SIZE, _SIZE)[0, 0] * p[:2] / p[2]
+        assert np.linalg.norm(bead - expected) < 0.1 * np.linalg.norm(expected) + 1.5
+
+
+def test_drawing_changes_nothing(view: Bench) -> None:
+    """Robot and bodies stay as they are, to the bit, and so does what follows."""
+    view.needs(Draws)
+    view.relies_on_repeating()
+    view.command(view.ready + 0.02)
+    expected = [view.digest(), *view.continuation()]
+    view.reset()
+    view.command(view.ready + 0.02)
+    view.stage.draw(_moved_ball(view), view.backend.cameras["left"], 32, 32)
+    assert [view.digest(), *view.continuation()] == expected
+
+
+# --- refused ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [0, -1])

@@ -22,13 +22,14 @@ from sart_toolkit.augment.executors import Attempt, RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.strategies import STRATEGIES
 from sart_toolkit.augment.validate import validate_dataset
-from sart_toolkit.backends.interface import Backend, Capabilities, Contact
+from sart_toolkit.backends.interface import Contact, KnowsBodies, Resets, SavesStates
 from sart_toolkit.data import writer
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     Annotation,
     PrecisionSphere,
+    Rates,
     apply_action,
     convergence_waypoint,
 )
@@ -223,7 +224,7 @@ def test_an_attempt_depends_on_seed_sphere_and_number_alone(
 
 @pytest.mark.parametrize("allocation", ALLOCATIONS)
 def test_every_sphere_gets_its_quota(peg_annotation, augment, tmp_path, allocation):
-    config = AugmentConfig(n=10, allocation=allocation, camera=None)
+    config = AugmentConfig(n=10, allocation=allocation, cameras=())
     dataset = augment(peg_annotation, tmp_path / "d", config)
     made = Counter(episode.provenance.sphere for episode in dataset)
     spheres = peg_annotation.spheres
@@ -317,14 +318,10 @@ def test_what_touches_in_spite_of_the_proof_ends_the_segment_at_once(
 
 
 def test_a_backend_that_reports_no_contacts_can_augment(
-    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+    peg_demonstration, peg_annotation, peg_backend, limited
 ):
-    blind = dataclasses.replace(peg_backend.capabilities, has_contacts=False)
-    monkeypatch.setattr(peg_backend, "capabilities", blind)
-    monkeypatch.setattr(peg_backend, "contacts", None)
-    make = RestoreExecutor(
-        peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig()
-    ).attempt
+    blind = limited(peg_backend, SavesStates, KnowsBodies)
+    make = RestoreExecutor(blind, [(peg_demonstration, peg_annotation)], AugmentConfig()).attempt
     assert make(AttemptKey(0, 0, 0)).outcome == KEPT
 
 
@@ -626,7 +623,7 @@ def two_sources(peg_task, peg_model, make_peg_backend, peg_demonstration):
 def test_the_spheres_of_all_demonstrations_share_the_trajectories(
     two_sources, make_peg_backend, peg_backend, peg_task, tmp_path
 ):
-    config = AugmentConfig(n=8, camera=None, duration=1.0)
+    config = AugmentConfig(n=8, cameras=(), duration=1.0)
     one, two = (
         augment_sources(two_sources, make_peg_backend, tmp_path / str(workers), config, workers)
         for workers in (1, 2)
@@ -655,7 +652,7 @@ def test_the_spheres_of_all_demonstrations_share_the_trajectories(
 def test_a_demonstration_s_episodes_do_not_depend_on_those_after_it(
     two_sources, make_peg_backend, tmp_path
 ):
-    config = AugmentConfig(n=6, camera=None, duration=1.0, allocation="equal")
+    config = AugmentConfig(n=6, cameras=(), duration=1.0, allocation="equal")
     both = augment_sources(two_sources, make_peg_backend, tmp_path / "both", config)
     config = dataclasses.replace(config, n=3)
     alone = augment_sources(two_sources[:1], make_peg_backend, tmp_path / "alone", config)
@@ -755,75 +752,60 @@ def test_a_demonstration_without_states_is_refused(
     assert not (tmp_path / "d").exists()
 
 
-class Arm(Backend):
-    """A made-up robot without any of the capabilities that augmentation needs."""
-
-    name = "arm"
-    capabilities = Capabilities(False, False, False, False)
-    open = 0
-
-    def __init__(self, *args):
-        super().__init__(*args)
-        Arm.open += 1
-
-    def close(self):
-        Arm.open -= 1
-
-    def reset(self, state):
-        raise self._lacks("reset")
-
-    def observe(self, cameras=(), image_size=None):
-        raise self._lacks("render")
-
-    def command(self, q, gripper):
-        raise self._lacks("move")
-
-    def step(self):
-        raise self._lacks("step")
-
-    def save(self):
-        raise self._lacks("save states")
-
-    def restore(self, state):
-        raise self._lacks("restore states")
-
-    def contacts(self):
-        raise self._lacks("report contacts")
-
-
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_backend_that_lacks_a_capability_is_refused_and_closed(
-    peg_demonstration, peg_annotation, peg_backend, tmp_path, workers
+def test_a_backend_that_cannot_restore_is_refused_and_closed(
+    peg_demonstration, peg_annotation, peg_backend, limited, monkeypatch, tmp_path, workers
 ):
-    def make():
-        return Arm(peg_backend.robot, peg_backend.scene)
-
-    with pytest.raises(MissingCapability, match="backend 'arm' can't restore states, which exec"):
+    closed = []
+    arm = limited(peg_backend, Resets)
+    monkeypatch.setattr(arm, "close", lambda: closed.append(True))
+    message = "backend 'limited' lacks the ability SavesStates, but segments start from"
+    with pytest.raises(MissingCapability, match=message):
         augment_demonstration(
-            peg_demonstration, peg_annotation, make, tmp_path / "d", workers=workers
+            peg_demonstration, peg_annotation, lambda: arm, tmp_path / "d", workers=workers
         )
-    assert Arm.open == 0
+    assert closed == [True] and not (tmp_path / "d").exists()
 
 
 def test_an_attempt_on_a_backend_that_cannot_restore_is_refused(
-    peg_demonstration, peg_annotation, peg_backend
+    peg_demonstration, peg_annotation, peg_backend, limited
 ):
-    arm = Arm(peg_backend.robot, peg_backend.scene)
-    with pytest.raises(MissingCapability, match="can't restore states; use another backend"):
-        RestoreExecutor(arm, [(peg_demonstration, peg_annotation)], AugmentConfig()).attempt(
-            AttemptKey(0, 0, 0)
-        )
-    arm.close()
+    arm = limited(peg_backend, Resets)
+    executor = RestoreExecutor(arm, [(peg_demonstration, peg_annotation)], AugmentConfig())
+    with pytest.raises(MissingCapability, match="lacks the ability SavesStates, but segments"):
+        executor.attempt(AttemptKey(0, 0, 0))
 
 
-def test_without_rendering_pictures_are_refused_and_their_lack_is_not(
-    annotate, augment, peg_backend, peg_demonstration, monkeypatch
+def test_a_backend_without_pictures_is_refused_unless_none_are_wanted(
+    peg_demonstration, peg_backend, limited
 ):
-    blind = dataclasses.replace(peg_backend.capabilities, renders=False)
-    monkeypatch.setattr(peg_backend, "capabilities", blind)
-    RestoreExecutor.check(peg_backend, [peg_demonstration], AugmentConfig(camera=None))
-    with pytest.raises(MissingCapability, match="can't render; augment without pictures, or use"):
-        RestoreExecutor.check(peg_backend, [peg_demonstration], AugmentConfig())
+    blind = limited(peg_backend, SavesStates, KnowsBodies)
+    blind.no_pictures = "it has no eyes"
+    with pytest.raises(MissingCapability, match="takes no pictures: it has no eyes"):
+        RestoreExecutor.check(blind, [peg_demonstration], AugmentConfig())
+    RestoreExecutor.check(blind, [peg_demonstration], AugmentConfig(cameras=()))
+
+
+def test_a_backend_at_other_rates_than_the_demonstration_s_is_refused(
+    peg_demonstration, peg_backend
+):
+    slow = dataclasses.replace(peg_demonstration, rates=Rates(record_hz=5))
+    with pytest.raises(Mismatch, match="rates: the demonstration was recorded with .*record_hz=5"):
+        RestoreExecutor.check(peg_backend, [slow], AugmentConfig())
+
+
+def test_a_segment_that_the_robot_can_t_follow_is_rejected(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+):
+    command = peg_backend.command
+
+    def cut_short(q, gripper):
+        return dataclasses.replace(command(q, gripper), q=q - 1e-3)
+
+    monkeypatch.setattr(peg_backend, "command", cut_short)
+    sources = [(peg_demonstration, peg_annotation)]
+    make = RestoreExecutor(peg_backend, sources, AugmentConfig()).attempt
+    assert make(AttemptKey(0, 0, 0)).outcome == "command cut short"
 
 
 @pytest.mark.parametrize("workers", [0, -1])
@@ -834,23 +816,23 @@ def test_at_least_one_process_is_needed(annotate, augment, tmp_path, workers):
 
 def test_an_unknown_camera_is_refused_with_the_nearest_name(annotate, augment, tmp_path):
     with pytest.raises(UnknownName, match="camera 'wirst': did you mean 'wrist'"):
-        augment(annotate((0, 0.05)), tmp_path / "d", AugmentConfig(camera="wirst"))
+        augment(annotate((0, 0.05)), tmp_path / "d", AugmentConfig(cameras=("wirst",)))
 
 
 @pytest.mark.parametrize("mistake", ["workers", "camera", "backend", "annotation"])
 def test_a_request_that_is_refused_replaces_nothing_even_if_it_may_overwrite(
-    annotate, peg_demonstration, make_peg_backend, peg_backend, interrupted, tmp_path, mistake
+    annotate, peg_demonstration, make_peg_backend, limited, interrupted, tmp_path, mistake
 ):
     out = shutil.copytree(interrupted, tmp_path / "d")
     annotation, make, config, workers = annotate((0, 0.05)), make_peg_backend, CROWDED, 1
     if mistake == "workers":
         workers = 0
     elif mistake == "camera":
-        config = dataclasses.replace(CROWDED, camera="wirst")
+        config = dataclasses.replace(CROWDED, cameras=("wirst",))
     elif mistake == "backend":
 
         def make():
-            return Arm(peg_backend.robot, peg_backend.scene)
+            return limited(make_peg_backend())
     else:
         annotation = dataclasses.replace(annotation, demonstration_hash="0" * 64)
     with pytest.raises(SartError, match="workers|wirst|use another backend|another demonstration"):

@@ -88,7 +88,7 @@ def annotate(demonstration):
 
 def config(strategy, **others):
     sampling = SamplingConfig("area")
-    return AugmentConfig(strategy=strategy, sampling=sampling, camera=None, **others)
+    return AugmentConfig(strategy=strategy, sampling=sampling, cameras=(), **others)
 
 
 @pytest.fixture(scope="module")

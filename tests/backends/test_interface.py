@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.backends.interface import Observation
-from sart_toolkit.data.records import CONTROL_HZ, PHYSICS_HZ
-from sart_toolkit.errors import MissingExtra, UnknownName
+from sart_toolkit.backends.interface import (
+    Draws,
+    Observation,
+    Resets,
+    SavesStates,
+    missing_abilities,
+    require,
+)
+from sart_toolkit.data.records import DEFAULT_RATES
+from sart_toolkit.errors import MissingCapability, MissingExtra, UnknownName
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.spec import SceneSpec
 from sart_toolkit.testing.bench import find_backend, make_bench
@@ -41,8 +48,8 @@ def test_the_joint_path_is_measured_at_each_physics_step(name):
         pytest.skip(str(error))
     bench.command(bench.ready + 0.5)
     seen = bench.see()
-    assert len(seen.joint_path) == PHYSICS_HZ // CONTROL_HZ
-    speeds = np.diff(seen.joint_path, axis=0) * PHYSICS_HZ
+    assert len(seen.joint_path) == DEFAULT_RATES.physics_per_control
+    speeds = np.diff(seen.joint_path, axis=0) * DEFAULT_RATES.physics_hz
     assert (np.diff(speeds[:, 0]) > 0.5).all()
     np.testing.assert_allclose(speeds[-1], seen.dq, rtol=0, atol=1e-3)
     bench.backend.close()
@@ -82,7 +89,7 @@ def _ray_cast(bench, camera, size):
 @pytest.mark.parametrize("size", [33, 64, 128])
 @pytest.mark.parametrize("camera", ["left", "right"])
 def test_depth_is_that_of_a_ray_cast_to_a_fifth_of_a_millimetre(view, camera, size):
-    view.needs("renders")
+    view.needs_pictures()
     depth = view.see((camera,), size).cameras[camera].depth
     expected = _ray_cast(view, camera, size)
     # The robot hides some, and the balls are made of facets; at an edge a pixel may show either.
@@ -90,3 +97,25 @@ def test_depth_is_that_of_a_ray_cast_to_a_fifth_of_a_millimetre(view, camera, si
     difference = (depth - expected)[seen]
     assert (np.abs(difference) < 2e-4).mean() > 0.7
     assert (difference > 2e-4).mean() < 0.02
+
+
+def test_an_ability_is_had_or_its_lack_is_told_with_the_purpose(limited):
+    backend = make_backend("pybullet", get_robot("ur5e_hande"), SceneSpec(()), 8)
+    assert require(backend, Resets, "tests reset it") is backend
+    core = limited(backend, Resets)
+    assert missing_abilities(core, [Resets, Draws, SavesStates]) == ["Draws", "SavesStates"]
+    message = "backend 'limited' lacks the ability Draws, but films are drawn; use another backend"
+    with pytest.raises(MissingCapability, match=message):
+        require(core, Draws, "films are drawn")
+    backend.close()
+
+
+def test_a_backend_without_pictures_still_tells_a_camera_that_is_not_there(limited):
+    backend = limited(make_backend("pybullet", get_robot("ur5e_hande"), SceneSpec(()), 8))
+    backend.no_pictures = "its lens is broken"
+    backend.check_cameras(())
+    with pytest.raises(UnknownName, match="unknown camera 'wirst': did you mean 'wrist'"):
+        backend.check_cameras(("wirst",))
+    with pytest.raises(MissingCapability, match="takes no pictures: its lens is broken; use an"):
+        backend.check_cameras(("wrist",))
+    backend.close()

@@ -15,7 +15,7 @@ import pytest
 
 from sart_toolkit.backends import make_backend
 from sart_toolkit.collision.model import primitive
-from sart_toolkit.data.records import CONTROL_HZ
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import CannotWrite, InvalidInput, MissingCapability, SartError
 from sart_toolkit.poses import distance, interpolate, pose
 from sart_toolkit.robots import get_robot
@@ -128,7 +128,7 @@ def _alone(body: Body, *others: Body, gravity=(0, 0, -9.81)) -> SapienBackend:
 
 def _run(backend, seconds: float, state=None):
     backend.reset(state or backend.scene.initial_state(backend.robot.home, 0.0))
-    for _ in range(round(seconds * CONTROL_HZ)):
+    for _ in range(round(seconds * DEFAULT_RATES.control_hz)):
         backend.step()
     return backend.observe()
 
@@ -186,10 +186,10 @@ def test_the_gripper_moves_no_faster_than_its_speed(name):
     backend.reset(backend.scene.initial_state(robot.home, 0.0))
     backend.command(robot.home, 1.0)
     seen = []
-    for _ in range(CONTROL_HZ):
+    for _ in range(DEFAULT_RATES.control_hz):
         backend.step()
         seen.append(backend.observe().gripper)
-    steps = np.diff(seen) * robot.gripper.closed_position * CONTROL_HZ
+    steps = np.diff(seen) * robot.gripper.closed_position * DEFAULT_RATES.control_hz
     assert steps.max() == pytest.approx(robot.gripper.speed, rel=0.02)
     assert seen[-1] == pytest.approx(1.0, abs=1e-3)
     backend.close()
@@ -259,8 +259,8 @@ def test_the_motion_after_a_restore_is_that_after_the_save_but_for_the_declared_
     for (a, _), (b, _) in zip(live, _wave(backend), strict=True):
         for name, T in a.Ts_world_body.items():
             apart, angle = distance(T, b.Ts_world_body[name])
-            assert apart <= backend.capabilities.drift
-            assert np.rad2deg(angle) <= backend.capabilities.drift_deg
+            assert apart <= backend.drift
+            assert np.rad2deg(angle) <= backend.drift_deg
 
 
 def test_two_backends_stepped_in_turn_do_what_each_does_alone():
@@ -446,7 +446,7 @@ from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.spec import SceneSpec
 robot = get_robot("ur5e_hande")
 backend = make_backend("sapien", robot, SceneSpec(()), 16)
-assert not backend.capabilities.renders and type(backend).capabilities.renders
+assert "draw here" in backend.no_pictures and not type(backend).no_pictures
 backend.reset(backend.scene.initial_state(robot.home, 0.5))
 backend.command(robot.home + 0.01, 0.5)
 backend.step()
@@ -522,7 +522,7 @@ def test_a_device_that_is_gone_since_the_probe_is_named(monkeypatch):
         raise RuntimeError("no device")
 
     backend = SapienBackend(get_robot("ur5e_hande"), SceneSpec(()), 16)
-    monkeypatch.setattr(backend, "_why_no_pictures", "")
+    monkeypatch.setattr(backend, "no_pictures", "")
     monkeypatch.setattr(sapien_pictures.sapien.render, "RenderSystem", gone)
     with pytest.raises(MissingCapability, match=r"can't draw here \(no device\); install Mesa"):
         backend.observe(("wrist",))
@@ -546,7 +546,7 @@ class _Worker:
         robot = self.backend.robot
         self.backend.reset(self.backend.scene.initial_state(robot.home, gripper))
         self.backend.step()
-        cameras = ("wrist",) if self.backend.capabilities.renders else ()
+        cameras = ("wrist",) if not self.backend.no_pictures else ()
         return float(self.backend.observe(cameras).gripper)
 
     def close(self) -> None:

@@ -27,7 +27,7 @@ from sart_toolkit.benchmark.segments import (
 from sart_toolkit.cli import main
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.manifest import AttemptKey
-from sart_toolkit.data.records import Annotation
+from sart_toolkit.data.records import DEFAULT_RATES, Annotation
 from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
 from sart_toolkit.motion import timing
 from sart_toolkit.motion.timing import Motion
@@ -193,7 +193,7 @@ def test_a_demonstration_that_fails_is_refused(
 @pytest.fixture(scope="module")
 def wide_motion(peg_world: ExactWorld, peg_annotation: Annotation) -> tuple[Motion, Array]:
     """A motion from the widest sphere, and the joints that it starts from."""
-    planner = SegmentPlanner(peg_world, peg_annotation, AugmentConfig(camera=None))
+    planner = SegmentPlanner(peg_world, peg_annotation, AugmentConfig(cameras=()))
     proposal, rng = planner.proposal(0, 0)
     q_start = peg_world.demonstration.steps.commanded_joint_positions[proposal.t_star]
     return planner.plan(proposal, rng)[0], q_start
@@ -203,7 +203,7 @@ def test_ratios_are_those_of_finite_differences(
     peg_model: RobotModel, wide_motion: tuple[Motion, Array]
 ) -> None:
     motion, q_start = wide_motion
-    found = check_motion(peg_model, motion, q_start)
+    found = check_motion(peg_model, motion, q_start, DEFAULT_RATES)
     dt = 1e-4
     q = motion.joints(np.arange(0.0, motion.duration, dt))
     spec = peg_model.spec
@@ -217,13 +217,15 @@ def test_the_tool_s_distance_from_the_path_is_measured(
 ) -> None:
     motion, _ = wide_motion
     on_path = motion.joints(np.linspace(0.3, 1.7, 50))
-    assert tool_off_path(peg_model, motion, on_path) < 1e-6
+    assert tool_off_path(peg_model, motion, on_path, DEFAULT_RATES) < 1e-6
     T = motion.T_world_tool(1.0)
     along = motion.T_world_tool(1.1)[:3, 3] - motion.T_world_tool(0.9)[:3, 3]
     across = np.cross(along, [0.0, 0.0, 1.0])
     T[:3, 3] += 0.003 * across / np.linalg.norm(across)
     q = peg_model.ik(T, motion.joints(np.array([1.0]))[0])
-    assert tool_off_path(peg_model, motion, q[None]) == pytest.approx(0.003, abs=1e-5)
+    assert tool_off_path(peg_model, motion, q[None], DEFAULT_RATES) == pytest.approx(
+        0.003, abs=1e-5
+    )
 
 
 @pytest.mark.parametrize(

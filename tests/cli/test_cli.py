@@ -311,6 +311,15 @@ def test_a_demonstration_that_fails_is_not_saved(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_several_cameras_and_rectangular_pictures_are_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["record", "peg_in_hole", "--out", tmp_path / "d.h5", "--image-size", "48x32"]
+    said = run(capsys, *argv, "--cameras", "wrist,overview")
+    assert said["cameras"] == {"wrist": "48x32", "overview": "48x32"}
+    assert "unknown camera 'top'" in error(capsys, *argv, "--overwrite", "--cameras", "wrist,top")
+
+
 def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str]) -> None:
     for verb in (
         "run",

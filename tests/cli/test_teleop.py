@@ -10,7 +10,6 @@ import sys
 import imageio_ffmpeg
 import pytest
 
-from sart_toolkit.backends.interface import Capabilities
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.cli import main
 from sart_toolkit.data.storage import (
@@ -147,9 +146,9 @@ def test_what_can_t_be_steered_with_is_one_line(tmp_path, capsys, dummy, options
 def test_a_backend_that_draws_nothing_can_t_be_steered_by_hand(
     tmp_path, capsys, dummy, monkeypatch
 ):
-    monkeypatch.setattr(PyBulletBackend, "capabilities", Capabilities(True, True, False, True))
+    monkeypatch.setattr(PyBulletBackend, "no_pictures", "it has no eyes")
     said = error(capsys, *RECORD, tmp_path / "d.h5", *BY_HAND)
-    assert "backend 'pybullet' draws no pictures to steer by" in said
+    assert "backend 'pybullet' takes no pictures: it has no eyes" in said
 
 
 @pytest.mark.window

@@ -63,7 +63,7 @@ def pictured(peg_demonstration):
         steps = peg_demonstration.steps
         if Ts is not None:
             steps = dataclasses.replace(steps, measured_Ts_world_tool=Ts)
-        T_tool_camera = steps.cameras["wrist"].T_tool_camera
+        T_tool_camera = steps.cameras["wrist"].T_frame_camera
         f = 0.5 * size / np.tan(np.deg2rad(30))
         K = np.array([[f, 0, (size - 1) / 2], [0, f, (size - 1) / 2], [0, 0, 1.0]])
         v, u = np.mgrid[:size, :size].reshape(2, -1)
@@ -79,7 +79,7 @@ def pictured(peg_demonstration):
             nearest = z.min(0)
             depth[t] = np.where(np.isfinite(nearest), nearest, 0).reshape(size, size)
         rgb = np.full((*depth.shape, 3), 90, np.uint8)
-        camera = CameraRecord(rgb, depth, K, T_tool_camera)
+        camera = CameraRecord(rgb, depth, K, "tool", T_tool_camera)
         return dataclasses.replace(
             peg_demonstration, steps=dataclasses.replace(steps, cameras={"wrist": camera})
         )
@@ -210,7 +210,7 @@ def test_points_are_within_depth_range_and_reach(pictured, robot):
     Ts = steps.measured_Ts_world_tool
     from_tool = np.linalg.norm(cloud.points[:, None] - Ts[:, :3, 3], axis=2).min(1)
     assert from_tool.max() <= 0.25
-    Ts_camera = Ts @ steps.cameras["wrist"].T_tool_camera
+    Ts_camera = Ts @ steps.cameras["wrist"].T_frame_camera
     z = np.stack([((cloud.points - T[:3, 3]) @ T[:3, :3])[:, 2] for T in Ts_camera])
     assert z.min(0).max() <= 0.45
     assert len(cloud) < len(fuse_cloud(demonstration, robot, (), config=CloudConfig()))

@@ -12,12 +12,14 @@ from hypothesis import given, settings
 
 from sart_toolkit.data import records
 from sart_toolkit.data.records import (
+    DEFAULT_RATES,
     Annotation,
     CameraRecord,
     Demonstration,
     Episode,
     PrecisionSphere,
     Provenance,
+    Rates,
     Steps,
     actions_from_commands,
     apply_action,
@@ -47,7 +49,8 @@ def make_camera(n, rng):
         rgb=rng.integers(0, 256, (n, 4, 6, 3), np.uint8),
         depth=rng.uniform(0, 2, (n, 4, 6)).astype(np.float32),
         intrinsics=np.diag([6.0, 6.0, 1.0]),
-        T_tool_camera=pose([0.05, 0, -0.1], [0.1, 0, 0]),
+        frame="tool",
+        T_frame_camera=pose([0.05, 0, -0.1], [0.1, 0, 0]),
     )
 
 
@@ -293,7 +296,7 @@ def test_a_key_pose_that_is_not_at_its_waypoint_is_a_mismatch(change):
         ({"rgb": np.zeros((2, 4, 6, 4), np.uint8)}, r"rgb: expected .* got uint8 \(2, 4, 6, 4\)"),
         ({"depth": np.zeros((2, 4, 5))}, r"depth: expected shape \(2, 4, 6\), got \(2, 4, 5\)"),
         ({"intrinsics": np.eye(2)}, r"intrinsics: expected shape \(3, 3\)"),
-        ({"T_tool_camera": np.zeros((4, 4))}, "T_tool_camera: not a rigid transform"),
+        ({"T_frame_camera": np.zeros((4, 4))}, "T_frame_camera: not a rigid transform"),
     ],
 )
 def test_a_camera_record_that_does_not_fit_is_refused(change, message):
@@ -433,7 +436,7 @@ def test_a_demonstrations_hash_follows_every_array_that_was_shown():
     camera = demonstration.steps.cameras["wrist"]
     for name in arrays_of(camera):
         changed = np.array(getattr(camera, name))
-        if name == "T_tool_camera":
+        if name == "T_frame_camera":
             changed[:3, :3] = exp_rotation(np.array([0.2, 0, 0]))
         else:
             changed.flat[-1] += 1
@@ -496,3 +499,53 @@ def test_library_versions_name_what_is_installed_and_skip_what_is_not(monkeypatc
 
     monkeypatch.setattr(records.importlib.metadata, "version", absent)
     assert set(library_versions()) == {"python"}
+
+
+# --- rates and mounts ---------------------------------------------------------------------------
+
+
+def test_rates_divide_each_other():
+    rates = Rates(physics_hz=240, control_hz=60, record_hz=15)
+    assert (rates.physics_per_control, rates.control_per_record) == (4, 4)
+    assert Rates(240, 30, 10) == DEFAULT_RATES
+
+
+@pytest.mark.parametrize(
+    ("rates", "message"),
+    [
+        ((240, 50, 10), r"physics_hz: expected a multiple of control_hz \(50 Hz\), got 240 Hz"),
+        ((240, 30, 20), r"control_hz: expected a multiple of record_hz \(20 Hz\), got 30 Hz"),
+        ((240, 30, 0), "record_hz: expected a whole number >= 1, got 0"),
+        ((240.0, 30, 10), "physics_hz: expected a whole number >= 1, got 240.0"),
+        ((240, True, True), "control_hz: expected a whole number >= 1, got True"),
+    ],
+)
+def test_rates_that_do_not_divide_are_refused(rates, message):
+    with pytest.raises(InvalidInput, match=message):
+        Rates(*rates)
+
+
+def test_the_rates_are_part_of_what_was_shown():
+    shown = make_demonstration()
+    slow = dataclasses.replace(shown, rates=Rates(record_hz=5))
+    assert slow.content_hash() != shown.content_hash()
+
+
+def test_a_camera_is_on_the_tool_or_in_the_world():
+    rng = np.random.default_rng(0)
+    Ts = random_walk(3, rng)
+    on_tool = make_camera(3, rng)
+    np.testing.assert_allclose(on_tool.Ts_world_camera(Ts), Ts @ on_tool.T_frame_camera)
+    np.testing.assert_allclose(on_tool.Ts_world_camera(Ts[1]), Ts[1] @ on_tool.T_frame_camera)
+    fixed = dataclasses.replace(on_tool, frame="world")
+    np.testing.assert_array_equal(
+        fixed.Ts_world_camera(Ts), np.tile(fixed.T_frame_camera, (3, 1, 1))
+    )
+    np.testing.assert_array_equal(fixed.Ts_world_camera(Ts[1]), fixed.T_frame_camera)
+    with pytest.raises(InvalidInput, match="frame: expected 'tool' or 'world', got 'wrist'"):
+        dataclasses.replace(on_tool, frame="wrist")
+
+
+def test_success_is_judged_by_the_task_a_person_or_nobody():
+    with pytest.raises(InvalidInput, match="judged_by: expected one of .*, got 'me'"):
+        dataclasses.replace(make_demonstration(), judged_by="me")

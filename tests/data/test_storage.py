@@ -25,6 +25,7 @@ from sart_toolkit.data.records import (
     Episode,
     PrecisionSphere,
     Provenance,
+    Rates,
     Steps,
     convergence_waypoint,
 )
@@ -79,7 +80,8 @@ def make_steps(n, rng, cameras=("wrist",), bodies=0):
                 rgb=rng.integers(0, 256, (n, 6, 8, 3), np.uint8),
                 depth=rng.uniform(0, 2, (n, 6, 8)).astype(np.float32),
                 intrinsics=np.diag([6.0, 6.0, 1.0]),
-                T_tool_camera=pose([0.05, 0, -0.1], [0.1, 0, 0]),
+                frame="world" if name == "overview" else "tool",
+                T_frame_camera=pose([0.05, 0, -0.1], [0.1, 0, 0]),
             )
             for name in cameras
         },
@@ -107,6 +109,8 @@ def make_demonstration(n=5, seed=0, cameras=("wrist",), bodies=("block",), state
         seconds=12.25,
         seed=None if seed % 2 else seed,
         versions={"numpy": "1"},
+        rates=Rates(record_hz=5 if seed % 2 else 10),
+        judged_by="person",
     )
 
 

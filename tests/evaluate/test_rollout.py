@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from sart_toolkit.data.records import RECORD_HZ
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.data.storage import read_json
 from sart_toolkit.errors import CannotWrite, InvalidInput, MissingFile, SartError
 from sart_toolkit.evaluate import rollout as module
@@ -36,6 +36,7 @@ class Player:
         self.actions = [np.array(action) for action in actions]
         self.config = SimpleNamespace(robot="ur5e_2f85", training=SimpleNamespace(policy="player"))
         self.cameras = ("wrist",)
+        self.demonstration = SimpleNamespace(rates=DEFAULT_RATES)
         self.seen = []
 
     def reset(self):
@@ -73,7 +74,7 @@ def test_replaying_the_demonstration_where_it_was_shown_succeeds(
     assert result.success and result.success_any and result.reason is None
     assert (result.episode, result.seed) == (3, (5, 3))
     first = int(np.argmax(peg_demonstration.success))
-    assert result.steps == pytest.approx(first + peg_task.hold * RECORD_HZ - 1, abs=2)
+    assert result.steps == pytest.approx(first + peg_task.hold * DEFAULT_RATES.record_hz - 1, abs=2)
 
 
 def test_a_rollout_ends_as_soon_as_success_has_lasted(roll_out, replay):
@@ -97,7 +98,7 @@ def test_replaying_the_demonstration_elsewhere_fails_and_says_by_how_much(roll_o
     assert re.match(r"peg 4\d mm beside the hole's axis, tip", result.reason)
 
 
-def test_a_rollout_ends_at_the_horizon_with_the_shortfall(roll_out):
+def test_a_rollout_ends_at_the_horizon_with_the_failure_reason(roll_out):
     task = get_task("peg_in_hole")
     task.horizon = 1.2
     result = roll_out(Player(), task=task)
@@ -109,7 +110,7 @@ def test_success_that_does_not_last_is_counted_apart(roll_out, peg_demonstration
     first = int(np.argmax(peg_demonstration.success)) + 2
     up = np.append([0, 0, -0.01, 0, 0, 0], 0.67)
     task = get_task("peg_in_hole")
-    task.horizon = first / RECORD_HZ + 1.5
+    task.horizon = first / DEFAULT_RATES.record_hz + 1.5
     result = roll_out(Player([*peg_demonstration.actions[:first], *[up] * 30]), task=task)
     assert result.success_any and not result.success
     assert "peg" in result.reason
@@ -142,7 +143,10 @@ def test_the_same_rollout_twice_is_the_same(roll_out, replay):
     for _ in range(2):
         pictures.append([])
         roll_out(
-            replay, Placement(0.01, 0.02), task, watch=lambda rgb, *_: pictures[-1].append(rgb)
+            replay,
+            Placement(0.01, 0.02),
+            task,
+            watch=lambda seen, *_: pictures[-1].append(seen.cameras["wrist"].rgb),
         )
     np.testing.assert_array_equal(*pictures)
     assert len(pictures[0]) >= 30

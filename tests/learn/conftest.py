@@ -62,7 +62,8 @@ def make_steps(
                 rgb=np.stack([blob_picture(u, v, rng, size) for u, v in places]),
                 depth=np.zeros((n, size, size), np.float32),
                 intrinsics=np.diag([size, size, 1.0]),
-                T_tool_camera=pose((0.05, 0.0, -0.1)),
+                frame="tool",
+                T_frame_camera=pose((0.05, 0.0, -0.1)),
             )
         },
     )

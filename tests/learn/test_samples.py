@@ -302,7 +302,7 @@ def test_an_episode_without_the_camera_is_refused(dataset, open_windows, tmp_pat
         open_windows(_with_last(tmp_path, dataset, steps))
 
 
-@pytest.mark.parametrize("field", ["intrinsics", "T_tool_camera", "size"])
+@pytest.mark.parametrize("field", ["intrinsics", "T_frame_camera", "size"])
 def test_an_episode_seen_by_another_camera_is_refused(dataset, field, open_windows, tmp_path):
     steps = dataset.episode(2).steps
     camera = steps.cameras["wrist"]

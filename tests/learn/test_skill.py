@@ -181,7 +181,7 @@ def test_a_skill_says_where_it_came_from(trained, dataset):
     config = skill.config
     assert (config.task, config.robot, config.backend) == ("blob", "none", "synthetic")
     assert list(config.cameras) == ["wrist"] and config.cameras["wrist"].size == (32, 32)
-    assert np.allclose(config.cameras["wrist"].T_tool_camera[:3, 3], [0.05, 0, -0.1])
+    assert np.allclose(config.cameras["wrist"].T_frame_camera[:3, 3], [0.05, 0, -0.1])
     assert dict(config.task_parameters) == {"gain": 0.01}
     assert SkillConfig.from_json(config.to_json()).to_json() == config.to_json()
 
@@ -255,7 +255,7 @@ def test_a_truncated_file_is_refused(trained, name):
         ({"robot": None}, "skill configuration: 'robot' is missing"),
         ({"colour": "red"}, "skill configuration: 'colour' is unknown"),
         ({"cameras": {}}, "cameras: expected wrist as in training, got none"),
-        ({"cameras": {"wrist": {"size": [4, 5]}}}, "camera 'wrist' .* 'T_tool_camera' is missing"),
+        ({"cameras": {"wrist": {"size": [4, 5]}}}, "camera 'wrist' .* 'T_frame_camera' is missing"),
         ({"cameras": 3}, "cameras: expected values by name, got 3"),
         ({"cameras": {"wrist": 3}}, "camera 'wrist' .*: expected values by name, got 3"),
         ({"training": {"policy": "compact_mpl"}}, "training options: 'epochs' is missing"),
@@ -274,7 +274,7 @@ def test_a_configuration_that_makes_no_sense_is_refused(trained, change, message
         ({"size": (32,)}, r"size: expected \(height, width\) \[pixels\], got \(32,\)"),
         ({"size": (0, 5)}, r"size: expected \(height, width\) \[pixels\], got \(0, 5\)"),
         ({"intrinsics": [[1]]}, "intrinsics: expected shape"),
-        ({"T_tool_camera": 2 * np.eye(4)}, "T_tool_camera: not a rigid transform"),
+        ({"T_frame_camera": 2 * np.eye(4)}, "T_frame_camera: not a rigid transform"),
     ],
 )
 def test_a_camera_is_checked_when_made(trained, change, message):

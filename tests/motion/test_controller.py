@@ -376,3 +376,16 @@ def test_a_bound_that_is_not_positive_is_refused(name, unit, bad):
 def test_the_lead_is_20_mm_and_5_degrees_unless_told_otherwise():
     config = ControllerConfig()
     assert (config.max_lead, config.max_lead_deg) == (0.020, 5.0)
+
+
+def test_the_command_goes_on_from_what_was_really_sent(controller, model):
+    T = controller.commanded_T_world_tool
+    targets = controller.move(T @ pose([0.01, 0, 0]), T, 1)
+    controller.acknowledge(targets[0])
+    np.testing.assert_allclose(controller.commanded_T_world_tool, T @ pose([0.01, 0, 0]))
+    short = 0.5 * (model.spec.home + targets[0])
+    controller.acknowledge(short)
+    np.testing.assert_array_equal(controller.commanded_q, short)
+    np.testing.assert_allclose(controller.commanded_T_world_tool, model.fk(short))
+    with pytest.raises(InvalidInput, match="q: expected shape"):
+        controller.acknowledge(short[:-1])

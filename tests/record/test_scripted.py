@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sart_toolkit.data.records import RECORD_HZ
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.record.scripted import OperatorStyle, ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
@@ -43,10 +43,10 @@ def test_another_rng_gives_another_demonstration(record, peg_demonstration):
 
 def test_speed_is_a_person_s_and_the_end_is_still(peg_demonstration, stages):
     positions = peg_demonstration.steps.measured_Ts_world_tool[:, :3, 3]
-    speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) * RECORD_HZ
+    speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) * DEFAULT_RATES.record_hz
     assert speed.max() < 1.3 * max(stage.speed for stage in stages)
     assert speed[-4:].max() < 0.005
-    assert 2.0 < len(peg_demonstration) / RECORD_HZ < 12.0
+    assert 2.0 < len(peg_demonstration) / DEFAULT_RATES.record_hz < 12.0
 
 
 def test_without_noise_the_last_leg_s_goal_is_met_within_its_tolerance(record, stages):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sart_toolkit.backends.interface import Capabilities
-from sart_toolkit.data.records import CONTROL_HZ, CONTROL_PER_RECORD, apply_action
+from sart_toolkit.backends.interface import KnowsBodies, Resets
+from sart_toolkit.data.records import DEFAULT_RATES, apply_action
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.poses import apply_motion, distance
@@ -43,7 +43,7 @@ class Hand(Device):
 
 def _integrated(T, raw_commands):
     for command in raw_commands:
-        T = apply_motion(T, command[:6] / CONTROL_HZ)
+        T = apply_motion(T, command[:6] / DEFAULT_RATES.control_hz)
     return T
 
 
@@ -64,7 +64,7 @@ def test_velocity_commands_integrate_in_the_tool_s_frame(
     expected = _integrated(commanded[0], [np.append(velocity, 0)] * periods)
     np.testing.assert_allclose(commanded[-1], expected, atol=1e-9)
     raw = demonstration.raw_commands
-    assert raw.shape == (CONTROL_PER_RECORD * (len(demonstration) - 1), 7)
+    assert raw.shape == (DEFAULT_RATES.control_per_record * (len(demonstration) - 1), 7)
     np.testing.assert_array_equal(raw[:periods, :6], np.tile(velocity, (periods, 1)))
     assert not raw[periods:, :6].any() and (raw[:, 6] == 0.67).all()
 
@@ -116,7 +116,7 @@ def test_the_camera_is_fixed_to_the_tool_as_recorded(peg_demonstration, peg_back
     peg_backend.restore(peg_demonstration.states[t])
     T_world_camera = peg_backend.observe(("wrist",)).cameras["wrist"].T_world_camera
     T_world_tool = peg_demonstration.steps.measured_Ts_world_tool[t]
-    np.testing.assert_allclose(T_world_tool @ record.T_tool_camera, T_world_camera, atol=1e-5)
+    np.testing.assert_allclose(T_world_tool @ record.T_frame_camera, T_world_camera, atol=1e-5)
 
 
 def test_each_saved_state_shows_exactly_what_was_recorded_then(peg_demonstration, peg_backend):
@@ -223,18 +223,15 @@ def test_progress_tells_the_seconds_recorded(peg_backend, peg_task, peg_model):
 
 
 def test_a_backend_without_restore_or_contacts_gives_no_states_and_no_forces(
-    make_peg_backend, peg_task, peg_model, monkeypatch
+    limited, peg_backend, peg_task, peg_model
 ):
-    backend = make_peg_backend()
-    capabilities = Capabilities(False, False, True, True)
-    monkeypatch.setattr(backend, "capabilities", capabilities)
-    monkeypatch.setattr(backend, "contacts", None)
+    backend = limited(peg_backend, Resets, KnowsBodies)
     demonstration = record_demonstration(
         backend, peg_task, peg_model, Hand(np.zeros(6), 3), config=BLIND
     )
     assert demonstration.states == ()
     assert np.isnan(demonstration.steps.contact_force).all()
-    backend.close()
+    assert demonstration.judged_by == "task"
 
 
 def test_contact_force_is_the_greatest_since_the_step_before(peg_demonstration):

@@ -36,14 +36,14 @@ def passed(pace, clock, seconds, each):
 @pytest.mark.parametrize("each", [0.001, 0.033, 0.05, 0.1, 0.2])
 def test_simulated_and_real_time_go_by_alike_however_often_it_is_asked(each):
     clock = Time()
-    pace = Pace(clock)
+    pace = Pace(30, clock)
     assert passed(pace, clock, 10.0, each) == pytest.approx(300, abs=2)
     assert pace.share > 0.97 and 0.0 <= pace.left() <= 1 / 30
 
 
 def test_a_machine_too_slow_runs_at_a_share_of_real_time_and_says_so():
     clock = Time()
-    pace = Pace(clock)
+    pace = Pace(30, clock)
     done = passed(pace, clock, 10.0, 0.5)
     assert done == pytest.approx(150, abs=20)
     assert 0.4 < pace.share < 0.6

@@ -54,7 +54,8 @@ def make_steps(p_world_tool: Array, size: int = 48) -> Steps:
         rgb=wrist_pictures(p_world_tool, size),
         depth=np.full((n, size, size), 0.2, np.float32),
         intrinsics=np.diag([50.0, 50.0, 1.0]),
-        T_tool_camera=pose((0.0, -0.1, -0.1)),
+        frame="tool",
+        T_frame_camera=pose((0.0, -0.1, -0.1)),
     )
     return Steps(
         joint_positions=np.zeros((n, 6)),

@@ -12,8 +12,10 @@ from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import make_backend
+from sart_toolkit.backends.interface import Draws, Resets
+from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.collision.exact import ExactWorld
-from sart_toolkit.errors import InvalidInput, UnknownName
+from sart_toolkit.errors import InvalidInput, MissingCapability, UnknownName
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.report.player import Playback, PlayWindow, SceneView, film
@@ -73,14 +75,45 @@ def test_the_scene_is_drawn_with_the_robot_where_it_was(demonstration, peg_backe
     assert (scene.picture(0, 64) != scene.picture(last, 64)).any()
 
 
-def test_a_segment_s_robot_is_where_its_joints_were(episode, peg_backend, peg_dataset):
-    scene = SceneView(episode, peg_backend, "overview")
-    scene.picture(0, 32)
+@pytest.fixture
+def drawn_states(monkeypatch):
+    """The states that are drawn from here on."""
+    states, draw = [], PyBulletBackend.draw
+
+    def noted(self, state, *options):
+        states.append(state)
+        return draw(self, state, *options)
+
+    monkeypatch.setattr(PyBulletBackend, "draw", noted)
+    return states
+
+
+def test_a_segment_s_robot_is_where_its_joints_were(
+    episode, peg_backend, peg_model, peg_dataset, drawn_states
+):
+    SceneView(episode, peg_backend, "overview").picture(0, 32)
     measured = peg_dataset.episode(0).steps.measured_Ts_world_tool[0]
-    np.testing.assert_allclose(peg_backend.observe().T_world_tool, measured, atol=1e-6)
+    np.testing.assert_allclose(peg_model.fk(drawn_states[0].q), measured, atol=1e-6)
 
 
-def test_what_is_carried_moves_with_the_tool_in_a_segment(tmp_path):
+def test_a_scene_is_drawn_by_a_backend_that_can_do_nothing_else(
+    demonstration, peg_backend, limited
+):
+    stage = limited(peg_backend, Draws)
+    expected = SceneView(demonstration, peg_backend, "overview").picture(3, 32)
+    np.testing.assert_array_equal(
+        SceneView(demonstration, stage, "overview").picture(3, 32), expected
+    )
+
+
+def test_a_backend_that_does_not_draw_is_refused(demonstration, peg_backend, limited):
+    with pytest.raises(
+        MissingCapability, match="lacks the ability Draws, but a recording is drawn"
+    ):
+        SceneView(demonstration, limited(peg_backend, Resets), "overview")
+
+
+def test_what_is_carried_moves_with_the_tool_in_a_segment(tmp_path, drawn_states):
     task = get_task("toolbox_picking")
     robot = get_robot(task.robot)
     make = functools.partial(make_backend, "pybullet", robot, task.scene, 32)
@@ -94,12 +127,13 @@ def test_what_is_carried_moves_with_the_tool_in_a_segment(tmp_path):
     made = augment_demonstration(shown, spheres, make, tmp_path / "d", AugmentConfig(n=2))
     playback = Playback("episode.h5", shown, made.episode(0))
     SceneView(playback, backend, "overview").picture(0, 32)
-    now = backend.observe()
+    (now,) = drawn_states
+    T_world_tool = model.fk(now.q)
     t = playback.waypoint(0)
     (name,) = scene.phases[t].grasped
     was = np.linalg.inv(shown.steps.measured_Ts_world_tool[t]) @ shown.body_Ts_world[name][t]
     np.testing.assert_allclose(
-        np.linalg.inv(now.T_world_tool) @ now.Ts_world_body[name], was, atol=1e-4
+        np.linalg.inv(T_world_tool) @ now.Ts_world_body[name], was, atol=1e-4
     )
     backend.close()
 

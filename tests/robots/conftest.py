@@ -87,7 +87,7 @@ def make_tiny(tmp_path: Path, own_cache: Path) -> Callable[..., RobotSpec]:
             "gripper": dataclasses.replace(gripper, **inside),
             "gripper_base": "gripper_base_link",
             "T_gripper_tool": pose([0, 0, 0.1]),
-            "wrist_camera": CameraSpec("wrist", "gripper_base_link", np.eye(4)),
+            "cameras": (CameraSpec("wrist", "gripper_base_link", np.eye(4)),),
         }
         return RobotSpec(**{**fields, **changes})
 

@@ -235,3 +235,16 @@ def test_a_model_keeps_its_spec_and_what_it_holds(make_tiny):
     assert dataclasses.is_dataclass(model.spec)
     with pytest.raises(ValueError, match="read-only"):
         model.lower[0] = 0
+
+
+def test_a_frame_moves_with_the_tool_stands_still_or_neither(model):
+    wrist = model.spec.cameras[0].frame
+    mounts = {
+        name: model.mount_of(name) for name in ("tool", wrist, "world", "base_link", "forearm_link")
+    }
+    assert mounts == {
+        "tool": "tool", wrist: "tool", "world": "world", "base_link": "world",
+        "forearm_link": None,
+    }  # fmt: skip
+    with pytest.raises(UnknownName, match="unknown frame 'forearm'"):
+        model.mount_of("forearm")

@@ -10,7 +10,14 @@ from hypothesis import given, settings
 from sart_toolkit.data.assets import asset
 from sart_toolkit.errors import InvalidInput, MissingExtra, MissingFile
 from sart_toolkit.poses import check_pose, inverse, pose
-from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, look_at, resource_path
+from sart_toolkit.robots.spec import (
+    Attachment,
+    CameraSpec,
+    Shape,
+    check_image_size,
+    look_at,
+    resource_path,
+)
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=50)
 
@@ -176,3 +183,23 @@ def test_a_missing_resource_is_told(tmp_path):
         resource_path("airo_models:x.urdf")
     with pytest.raises(MissingFile, match="no such file"):
         resource_path(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("given", "size"),
+    [(64, (64, 64)), ("64", (64, 64)), ("160x120", (160, 120)), ((160, 120), (160, 120))],
+)
+def test_a_picture_s_size_is_a_number_or_width_and_height(given, size):
+    assert check_image_size(given) == size
+    assert check_image_size(np.array(given) if isinstance(given, tuple) else given) == size
+
+
+@pytest.mark.parametrize("bad", [0, -3, "0x4", "4x", "x", "1x2x3", (1, 2, 3), 64.5, "big", ()])
+def test_a_size_without_pixels_is_refused(bad):
+    with pytest.raises(InvalidInput, match="image_size: expected pixels, at least 1, as a number"):
+        check_image_size(bad)
+
+
+def test_two_cameras_of_one_name_on_a_robot_are_refused(spec):
+    with pytest.raises(InvalidInput, match="cameras of .*: expected different names"):
+        dataclasses.replace(spec, cameras=2 * spec.cameras)

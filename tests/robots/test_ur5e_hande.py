@@ -39,12 +39,12 @@ def test_the_tool_frame_lies_midway_between_parallel_jaws(jaws):
 
 
 def test_the_wrist_camera_sees_the_closed_jaws_and_20_cm_around_what_is_40_cm_below():
-    K = SPEC.wrist_camera.intrinsics(128, 128)
-    T_camera_tool = inverse(SPEC.wrist_camera.T_frame_camera) @ SPEC.T_gripper_tool
+    K = SPEC.cameras[0].intrinsics(128, 128)
+    T_camera_tool = inverse(SPEC.cameras[0].T_frame_camera) @ SPEC.T_gripper_tool
     below = [np.array([x, y, 0.4]) for x in (-0.2, 0.2) for y in (-0.2, 0.2)]
     for p_tool in [np.array([0, 0, JAW_BELOW_TOOL]), *below]:
         u, v, w = K @ (T_camera_tool @ np.append(p_tool, 1))[:3]
-        assert w > SPEC.wrist_camera.near
+        assert w > SPEC.cameras[0].near
         assert 0 <= u / w <= 127
         assert 0 <= v / w <= 127
 

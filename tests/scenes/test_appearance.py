@@ -31,7 +31,7 @@ def test_looks_vary_within_what_was_asked_for(task):
         assert abs(light.ambient / task.scene.light.ambient - 1) <= config.ambient
         turned = np.rad2deg(np.arccos(light.direction @ task.scene.light.direction))
         assert turned <= np.sqrt(3) * config.light_deg
-        cameras = [r.wrist_camera.T_frame_camera for r in (robot, varied)]
+        cameras = [r.cameras[0].T_frame_camera for r in (robot, varied)]
         far, turn = distance(*cameras)
         assert far <= np.sqrt(3) * config.camera
         assert 0 < np.rad2deg(turn) <= np.sqrt(3) * config.camera_deg
@@ -49,7 +49,7 @@ def test_nothing_but_looks_changes_and_shapes_of_one_colour_stay_alike(task):
         for was, now in zip(old.shapes, new.shapes, strict=True):
             assert alike.setdefault(was.rgba, now.rgba) == now.rgba
     assert scene.held == task.scene.held
-    assert dataclasses.replace(varied, wrist_camera=robot.wrist_camera) is not varied
+    assert dataclasses.replace(varied, cameras=robot.cameras) is not varied
 
 
 def test_a_seed_gives_the_same_looks_and_another_seed_others(task):

@@ -241,3 +241,16 @@ def test_what_two_fingers_touch_and_is_free_is_in_the_grasp():
     touching = [("cup", "left"), ("cup", "table"), ("door", "forearm"), ("elbow", "wrist")]
     assert scene.outer_contacts(touching, {"cup"}) == {("cup", "table"), ("door", "forearm")}
     assert scene.outer_contacts(touching, ()) == {("cup", "left"), ("door", "forearm")}
+
+
+def test_a_state_is_read_from_measured_poses_a_little_out_of_range_or_not():
+    joint = Joint("box", pose([0, 0, 0.1]), np.array([0, 0, 1.0]), 0.0, 1.0, "prismatic")
+    scene = SceneSpec((Body("box", BOX), Body("lid", BOX, mass=0.1, joint=joint)))
+    lid = pose([1, 0, 0]) @ joint.T_parent_moved(1.0 + 1e-6)
+    seen = {"box": pose([1, 0, 0]), "lid": lid, "peg": np.eye(4)}
+    state = scene.seen_state(np.zeros(6), 1.0001, seen)
+    scene.check_state(state)
+    assert state.joint_positions == {"lid": 1.0} and state.gripper == 1.0
+    np.testing.assert_allclose(state.Ts_world_body["lid"], lid, atol=1e-5)
+    with pytest.raises(UnknownName, match="unknown body 'lid'"):
+        scene.seen_state(np.zeros(6), 0.5, {"box": np.eye(4)})

@@ -61,9 +61,9 @@ def test_success_is_what_the_card_says(x, y, z, tilt, about, opening):
         (_observation([0, 0, 0], opening=0.03), "bottle in the cup, but the jaws only 30 mm apart"),
     ],
 )
-def test_a_shortfall_says_what_is_missing(observation, text):
+def test_a_failure_reason_says_what_is_missing(observation, text):
     assert not TASK.success(observation)
-    assert TASK.shortfall(observation) == text
+    assert TASK.failure_reason(observation) == text
 
 
 def test_the_cup_is_as_wide_and_deep_inside_as_its_card_says():
@@ -129,4 +129,4 @@ def test_the_bottle_does_not_slip_and_nothing_else_is_touched(demonstrate):
 def test_no_other_way_is_a_success(demonstrate, backend, change, text):
     demonstration = demonstrate(change)
     assert not demonstration.success.any()
-    assert re.search(text, TASK.shortfall(backend.observe()))
+    assert re.search(text, TASK.failure_reason(backend.observe()))

@@ -42,8 +42,8 @@ def test_success_is_45_degrees_wherever_the_cabinet_stands(opened, x, y, yaw):
         assert TASK.success(observation) is (opened > 45)
 
 
-def test_a_shortfall_says_how_far_the_door_is_open():
-    assert TASK.shortfall(_observation(30.2, np.eye(4))) == "door open by 30 of 45 deg"
+def test_a_failure_reason_says_how_far_the_door_is_open():
+    assert TASK.failure_reason(_observation(30.2, np.eye(4))) == "door open by 30 of 45 deg"
 
 
 def _opened_deg(demonstration):

@@ -51,9 +51,9 @@ def test_success_is_what_the_card_says(angle_deg, above, x):
         (_observation(0.5, 0.004), "lid shut, but the jaws only 4 mm above it"),
     ],
 )
-def test_a_shortfall_says_what_is_missing(observation, text):
+def test_a_failure_reason_says_what_is_missing(observation, text):
     assert not TASK.success(observation)
-    assert TASK.shortfall(observation) == text
+    assert TASK.failure_reason(observation) == text
 
 
 def test_spring_and_catch_are_as_strong_as_the_card_says():
@@ -114,4 +114,4 @@ def test_no_other_way_is_a_success(demonstrate, backend, change, opens):
     demonstration = demonstrate(change)
     assert not demonstration.success.any()
     text = f"lid {OPEN_DEG:.0f} deg open" if opens else "lid shut, but the jaws only .* mm above"
-    assert re.match(text, TASK.shortfall(backend.observe()))
+    assert re.match(text, TASK.failure_reason(backend.observe()))

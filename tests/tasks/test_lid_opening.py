@@ -40,8 +40,8 @@ def test_success_is_more_than_120_degrees_wherever_the_box_stands(opened, x, y, 
         assert TASK.success(observation) is (opened > 120)
 
 
-def test_a_shortfall_says_how_far_the_lid_is_open():
-    assert TASK.shortfall(_observation(89.7, np.eye(4))) == "lid open by 90 of 120 deg"
+def test_a_failure_reason_says_how_far_the_lid_is_open():
+    assert TASK.failure_reason(_observation(89.7, np.eye(4))) == "lid open by 90 of 120 deg"
 
 
 def _opened_deg(demonstration):

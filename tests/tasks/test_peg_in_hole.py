@@ -74,10 +74,10 @@ def test_success_does_not_depend_on_where_the_block_stands(x, y, z, tilt, about,
         ([0, 0, -0.01], 0, "peg in the hole but only 10 mm deep"),
     ],
 )
-def test_a_shortfall_says_what_is_missing_in_millimetres_and_degrees(tip, tilt, text):
+def test_a_failure_reason_says_what_is_missing_in_millimetres_and_degrees(tip, tilt, text):
     observation = _observation(tip, tilt)
     assert not TASK.success(observation)
-    assert TASK.shortfall(observation) == text
+    assert TASK.failure_reason(observation) == text
 
 
 def _lower(backend, model, q, T_goal, periods=90):

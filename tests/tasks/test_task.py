@@ -14,7 +14,7 @@ from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel
-from sart_toolkit.data.records import RECORD_HZ
+from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import inverse
 from sart_toolkit.record.scripted import ScriptedOperator
@@ -111,7 +111,7 @@ def test_yaw_is_drawn_only_where_asked_for_and_within_what_the_operator_masters(
 
 
 def test_success_counts_as_achieved_when_it_lasted_until_the_end(task):
-    steps = round(task.hold * RECORD_HZ)
+    steps = round(task.hold * DEFAULT_RATES.record_hz)
     success = np.ones(steps + 5, bool)
     success[:5] = False
     assert task.achieved(success)
@@ -146,7 +146,7 @@ def test_at_the_start_there_is_room_for_a_sphere_that_covers_every_placement(tas
         assert nearest.distance > needed, nearest
         assert placed.distances(seen.q).min() > 0
         assert not task.success(seen)
-        assert task.shortfall(seen)
+        assert task.failure_reason(seen)
 
 
 def test_the_object_is_in_the_wrist_view_at_every_corner_of_its_range(task, model, backend):
@@ -180,7 +180,7 @@ def test_the_scripted_operator_succeeds_wherever_the_object_stands(task, model, 
             placement,
             config=SessionConfig(cameras=(), keep_states=False),
         )
-        assert len(demonstration) < task.horizon * RECORD_HZ
+        assert len(demonstration) < task.horizon * DEFAULT_RATES.record_hz
         assert not demonstration.success[0]
         assert task.achieved(demonstration.success), (i, placement)
 

@@ -64,9 +64,9 @@ def test_success_is_what_the_card_says(height, tilt, about, bar, yaw):
         (_observation(0.02), "toolbox between the fingers but only 20 mm above the table"),
     ],
 )
-def test_a_shortfall_says_what_is_missing(observation, text):
+def test_a_failure_reason_says_what_is_missing(observation, text):
     assert not TASK.success(observation)
-    assert TASK.shortfall(observation) == text
+    assert TASK.failure_reason(observation) == text
 
 
 def _moved(stages, *p_tool):
@@ -118,4 +118,4 @@ def test_the_box_hangs_still_between_the_pads_and_nothing_else_is_touched(demons
 def test_no_other_way_is_a_success(demonstrate, backend, change, text):
     demonstration = demonstrate(change)
     assert not demonstration.success.any()
-    assert re.search(text, TASK.shortfall(backend.observe()))
+    assert re.search(text, TASK.failure_reason(backend.observe()))

@@ -8,12 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sart_toolkit.backends.interface import CameraView, Contact, Observation
+from sart_toolkit.backends.interface import CameraView, CommandSent, Contact, Observation
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.backends.states import pack_state, unpack_state
-from sart_toolkit.errors import MissingCapability
 from sart_toolkit.poses import Array
-from sart_toolkit.robots.spec import CameraSpec, RobotSpec
+from sart_toolkit.robots.spec import CameraSpec, ImageSize, RobotSpec
 from sart_toolkit.scenes.spec import Joint, SceneSpec, SceneState
 
 # --- pictures -----------------------------------------------------------------------------------
@@ -25,21 +24,10 @@ class _SpoiledCamera(PyBulletBackend):
     def spoilt(self, spec: CameraSpec) -> CameraSpec:
         return spec
 
-    @property
-    def cameras(self) -> dict[str, CameraSpec]:
-        right = super().cameras
-        taking = getattr(self, "_taking", False)
-        return {name: self.spoilt(spec) for name, spec in right.items()} if taking else right
-
-    def _picture(self, name: str, Ts: dict[str, Array], size: int) -> CameraView:
-        spec = self.cameras[name]
-        T = np.eye(4) if spec.frame == "world" else Ts[spec.frame]
-        self._taking = True
-        try:
-            view = super()._picture(name, Ts, size)
-        finally:
-            self._taking = False
-        return dataclasses.replace(view, T_world_camera=T @ spec.T_frame_camera)
+    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        view = super()._picture(self.spoilt(camera), width, height)
+        T = self._frame_pose(camera.frame) @ camera.T_frame_camera
+        return dataclasses.replace(view, T_world_camera=T)
 
 
 class CameraOfOpenGL(_SpoiledCamera):
@@ -61,8 +49,8 @@ class _SpoiledPicture(PyBulletBackend):
     def spoilt(self, view: CameraView, spec: CameraSpec) -> CameraView:
         raise NotImplementedError
 
-    def _picture(self, name: str, Ts: dict[str, Array], size: int) -> CameraView:
-        return self.spoilt(super()._picture(name, Ts, size), self.cameras[name])
+    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        return self.spoilt(super()._picture(camera, width, height), camera)
 
 
 class DepthInMillimetres(_SpoiledPicture):
@@ -72,10 +60,10 @@ class DepthInMillimetres(_SpoiledPicture):
 
 class DepthAlongTheRay(_SpoiledPicture):
     def spoilt(self, view: CameraView, spec: CameraSpec) -> CameraView:
-        n = len(view.depth)
-        rows, columns = np.mgrid[:n, :n]
-        rays = np.stack([columns, rows, np.ones((n, n))], -1)
-        length = np.linalg.norm(rays @ np.linalg.inv(spec.intrinsics(n, n)).T, axis=-1)
+        height, width = view.depth.shape
+        rows, columns = np.mgrid[:height, :width]
+        rays = np.stack([columns, rows, np.ones((height, width))], -1)
+        length = np.linalg.norm(rays @ np.linalg.inv(spec.intrinsics(width, height)).T, axis=-1)
         return dataclasses.replace(view, depth=(view.depth * length).astype(np.float32))
 
 
@@ -98,21 +86,53 @@ class BlueGreenRed(_SpoiledPicture):
 class CameraPoseOfItsFrame(PyBulletBackend):
     """`T_world_camera` leaves out where the camera is in its frame."""
 
-    def _picture(self, name: str, Ts: dict[str, Array], size: int) -> CameraView:
-        view, spec = super()._picture(name, Ts, size), self.cameras[name]
-        T = np.eye(4) if spec.frame == "world" else Ts[spec.frame]
-        return dataclasses.replace(view, T_world_camera=T)
+    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        view = super()._picture(camera, width, height)
+        return dataclasses.replace(view, T_world_camera=self._frame_pose(camera.frame))
 
 
 class WristCameraStays(PyBulletBackend):
     """The wrist camera's pictures are taken from where it is at home."""
 
-    def _picture(self, name: str, Ts: dict[str, Array], size: int) -> CameraView:
-        home = {k: self._model.fk(self.robot.home, k) for k in Ts}
-        T_world_camera = super()._picture(name, Ts, 1).T_world_camera
-        return dataclasses.replace(
-            super()._picture(name, home, size), T_world_camera=T_world_camera
-        )
+    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        T_world_camera = self._frame_pose(camera.frame) @ camera.T_frame_camera
+        if camera.frame != "world":
+            T = self._model.fk(self.robot.home, camera.frame) @ camera.T_frame_camera
+            camera = dataclasses.replace(camera, frame="world", T_frame_camera=T)
+        view = super()._picture(camera, width, height)
+        return dataclasses.replace(view, T_world_camera=T_world_camera)
+
+
+class PicturesStretched(PyBulletBackend):
+    """A picture shows a square of the world, whatever its shape."""
+
+    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        view = super()._picture(camera, height, height)
+        columns = (np.arange(width) + 0.5) * height / width
+        rgb, depth = view.rgb[:, columns.astype(int)], view.depth[:, columns.astype(int)]
+        return dataclasses.replace(view, rgb=rgb, depth=depth)
+
+
+class DrawsThePresent(PyBulletBackend):
+    """Draws where everything is now, whatever state it is given."""
+
+    def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
+        return self._picture(camera, width, height)
+
+
+class DrawsItsOwnCamera(PyBulletBackend):
+    """Draws by the scene's camera of the name."""
+
+    def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
+        return super().draw(state, self.cameras[camera.name], width, height)
+
+
+class DrawingResets(PyBulletBackend):
+    """Robot and bodies stay in the state that was drawn."""
+
+    def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
+        self.reset(state)
+        return self._picture(camera, width, height)
 
 
 # --- motion -------------------------------------------------------------------------------------
@@ -121,10 +141,11 @@ class WristCameraStays(PyBulletBackend):
 class StuckJoint(PyBulletBackend):
     """The last joint ignores commands."""
 
-    def command(self, q: Array, gripper: float) -> None:
+    def command(self, q: Array, gripper: float) -> CommandSent:
         stays = self._last_target[len(self._arm) - 1]
-        super().command(q, gripper)
+        sent = super().command(q, gripper)
         self._target[len(self._arm) - 1] = stays
+        return sent
 
 
 class LateJoints(PyBulletBackend):
@@ -151,8 +172,8 @@ class JointPathIsLate(PyBulletBackend):
 
     _measured: list[list[float]]
 
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
-        super().__init__(robot, scene, image_size)
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
+        super().__init__(robot, scene, *options)
         self._measured = []
 
     def step(self) -> None:
@@ -178,7 +199,9 @@ class JointPathOutlivesARestore(PyBulletBackend):
 
 
 class ToolIsTheFlange(PyBulletBackend):
-    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
         seen = super().observe(cameras, image_size)
         T = self._model.fk(seen.q, self.robot.gripper_base)
         return dataclasses.replace(seen, T_world_tool=T)
@@ -187,7 +210,9 @@ class ToolIsTheFlange(PyBulletBackend):
 class HeldLeftBehind(PyBulletBackend):
     """The stick is said to be where it is at home."""
 
-    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
         seen = super().observe(cameras, image_size)
         Ts = dict(seen.Ts_world_body)
         if "stick" in Ts:
@@ -204,9 +229,10 @@ class InstancesShareTargets(PyBulletBackend):
         super().reset(state)
         InstancesShareTargets._everybody_s = None
 
-    def command(self, q: Array, gripper: float) -> None:
-        super().command(q, gripper)
+    def command(self, q: Array, gripper: float) -> CommandSent:
+        sent = super().command(q, gripper)
         InstancesShareTargets._everybody_s = self._target
+        return sent
 
     def step(self) -> None:
         if self._everybody_s is not None:
@@ -229,10 +255,20 @@ class NoisySteps(PyBulletBackend):
 class ClippedCommands(PyBulletBackend):
     """A bad command is made a good one."""
 
-    def command(self, q: Array, gripper: float) -> None:
+    def command(self, q: Array, gripper: float) -> CommandSent:
         if np.shape(q) == self._model.lower.shape and np.isfinite(q).all():
             q = np.clip(q, self._model.lower, self._model.upper)
-        super().command(q, gripper)
+        return super().command(q, gripper)
+
+
+class SaysItSentMore(PyBulletBackend):
+    """Goes no farther than a little at a time, and says that it goes all the way."""
+
+    def command(self, q: Array, gripper: float) -> CommandSent:
+        sent = super().command(q, gripper)
+        here = self._last_target[: len(self._arm)]
+        self._target[: len(self._arm)] = here + np.clip(sent.q - here, -0.05, 0.05)
+        return sent
 
 
 # --- gripper ------------------------------------------------------------------------------------
@@ -241,8 +277,8 @@ class ClippedCommands(PyBulletBackend):
 class GripperInverted(PyBulletBackend):
     """1 opens it."""
 
-    def command(self, q: Array, gripper: float) -> None:
-        super().command(q, 1.0 - gripper)
+    def command(self, q: Array, gripper: float) -> CommandSent:
+        return super().command(q, 1.0 - gripper)
 
 
 class _OtherGripper(PyBulletBackend):
@@ -250,10 +286,10 @@ class _OtherGripper(PyBulletBackend):
 
     changes: ClassVar[dict[str, float]] = {}
 
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
         changed = {name: getattr(robot.gripper, name) * by for name, by in self.changes.items()}
         gripper = dataclasses.replace(robot.gripper, **changed)
-        super().__init__(dataclasses.replace(robot, gripper=gripper), scene, image_size)
+        super().__init__(dataclasses.replace(robot, gripper=gripper), scene, *options)
 
 
 class GripperClosesHalfWay(_OtherGripper):
@@ -267,8 +303,8 @@ class GripperTooFast(_OtherGripper):
 
 
 class SlipperyFingers(PyBulletBackend):
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
-        super().__init__(robot, scene, image_size)
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
+        super().__init__(robot, scene, *options)
         for link in self._links.values():
             self._client.changeDynamics(self._robot, link, lateralFriction=0.0)
 
@@ -374,8 +410,8 @@ class ForcesInKilograms(PyBulletBackend):
 
 
 class HingesWithoutFriction(PyBulletBackend):
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
-        super().__init__(robot, scene, image_size)
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
+        super().__init__(robot, scene, *options)
         c = self._client
         for index, link in self._bodies.values():
             if link >= 0:
@@ -388,8 +424,8 @@ class _OtherJoints(PyBulletBackend):
     def spoilt(self, joint: Joint) -> Joint:
         raise NotImplementedError
 
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
-        super().__init__(robot, scene, image_size)
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
+        super().__init__(robot, scene, *options)
         self._springs = [(i, link, self.spoilt(joint)) for i, link, joint in self._springs]
 
 
@@ -414,16 +450,16 @@ class DetentsOnlyDrawIn(_OtherJoints):
 
 
 class JointsWithoutLimits(PyBulletBackend):
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
-        super().__init__(robot, scene, image_size)
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
+        super().__init__(robot, scene, *options)
         for index, link in self._bodies.values():
             if link >= 0:
                 self._client.changeDynamics(index, link, jointLowerLimit=-9, jointUpperLimit=9)
 
 
 class BodiesFallInHoney(PyBulletBackend):
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
-        super().__init__(robot, scene, image_size)
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
+        super().__init__(robot, scene, *options)
         for index, link in self._bodies.values():
             if link < 0:
                 self._client.changeDynamics(index, link, linearDamping=0.6)
@@ -518,32 +554,59 @@ class HistoryInTheBytes(PyBulletBackend):
 class AnyScene(PyBulletBackend):
     """A saved state doesn't say which scene it is of."""
 
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
-        super().__init__(robot, scene, image_size)
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
+        super().__init__(robot, scene, *options)
         self._scene_digest = ""
 
 
-# --- capabilities and instances -----------------------------------------------------------------
+# --- abilities and instances --------------------------------------------------------------------
 
 
-class DeclaresPictures(PyBulletBackend):
-    """Declares that it renders, and can't."""
+class NoBodiesAfterAll(PyBulletBackend):
+    """Has the ability to know bodies, and tells of none."""
 
-    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
-        self._check_cameras(cameras)
-        if cameras:
-            raise MissingCapability(f"backend {self.name!r} can't take pictures")
-        return super().observe()
+    def body_poses(self) -> dict[str, Array]:
+        return {}
+
+
+class ForgetsWhatItHolds(PyBulletBackend):
+    """Tells where the scene's bodies are, not where the stick in the gripper is."""
+
+    def body_poses(self) -> dict[str, Array]:
+        return {name: T for name, T in super().body_poses().items() if name != "stick"}
 
 
 class SilentlyWithoutPictures(PyBulletBackend):
-    """Declares that it can't render, and returns no pictures instead of saying so."""
+    """Returns no pictures, and gives no reason."""
 
-    capabilities = dataclasses.replace(PyBulletBackend.capabilities, renders=False)
-
-    def observe(self, cameras: Sequence[str] = (), image_size: int | None = None) -> Observation:
-        self._check_cameras(cameras)
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
+        self.check_cameras(cameras)
         return super().observe()
+
+
+class SilentThoughItHasAReason(PyBulletBackend):
+    """Declares that it takes no pictures, and leaves them out where they are asked for."""
+
+    no_pictures = "has no cameras"
+
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
+        for name in cameras:
+            if name not in self.cameras:
+                self.check_cameras([name])
+        return super().observe()
+
+
+class RatesOfItsOwn(PyBulletBackend):
+    """Steps as long as ever, whatever rates it is made for."""
+
+    def step(self) -> None:
+        before = self._time
+        super().step()
+        self._time = before + 1 / 30
 
 
 class CloseOnlyOnce(PyBulletBackend):
@@ -557,8 +620,8 @@ class CloseReachesTheNext(PyBulletBackend):
 
     _made: ClassVar[list[PyBulletBackend]] = []
 
-    def __init__(self, robot: RobotSpec, scene: SceneSpec, image_size: int = 128) -> None:
-        super().__init__(robot, scene, image_size)
+    def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
+        super().__init__(robot, scene, *options)
         self._made.append(self)
 
     def close(self) -> None:

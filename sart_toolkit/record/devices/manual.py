@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sart_toolkit.backends.interface import Observation
-from sart_toolkit.data.records import CONTROL_HZ
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.record.session import Device, DeviceSetup, Frame, TeleopCommand
@@ -57,10 +56,11 @@ class Views:
 def views(model: RobotModel, scene: SceneSpec) -> Views:
     """The hand's directions for a robot and its scene.
 
-    Without a camera in the scene the person is taken to stand behind the robot.
+    Without a camera in the scene the person is taken to stand behind the robot, and without one on
+    the tool to see its x axis point right.
 
     Args:
-        model: the robot's kinematics, with its wrist camera.
+        model: the robot's kinematics, with the first camera on its tool.
         scene: has the camera of the scene view.
     """
     up = np.array([0.0, 0.0, 1.0])
@@ -71,11 +71,14 @@ def views(model: RobotModel, scene: SceneSpec) -> Views:
         # A camera on its side has no level right; the robot's will do.
         if np.linalg.norm(level) > 0.1:
             right = level / np.linalg.norm(level)
-    camera, home = model.spec.wrist_camera, model.spec.home
-    T_tool_camera = inverse(model.fk(home)) @ model.fk(home, camera.frame) @ camera.T_frame_camera
-    # Along an axis of the tool, though the camera be mounted a little askew.
-    axis = int(np.argmax(np.abs(T_tool_camera[:2, 0])))
-    tool_right = np.eye(3)[axis] * np.sign(T_tool_camera[axis, 0])
+    tool_right, home = np.eye(3)[0], model.spec.home
+    mounted = [c for c in model.spec.cameras if model.mount_of(c.frame) == "tool"]
+    for camera in mounted[:1]:
+        T_tool_frame = inverse(model.fk(home)) @ model.fk(home, camera.frame)
+        across = (T_tool_frame @ camera.T_frame_camera)[:2, 0]
+        # Along an axis of the tool, though the camera be mounted a little askew.
+        axis = int(np.argmax(np.abs(across)))
+        tool_right = np.eye(3)[axis] * np.sign(across[axis])
     return Views(_axes(right, up), _axes(tool_right, -up))
 
 
@@ -110,6 +113,7 @@ class ManualDevice(Device):
         self.speed = SPEEDS[1]
         self.frame: Frame = setup.frame
         self._views = views(setup.model, setup.backend.scene)
+        self._dt = 1.0 / setup.backend.rates.control_hz
         self._start_gripper = setup.state.commanded_gripper
         self._controls: list[Control] = []
         self.rest()
@@ -203,8 +207,9 @@ class ManualDevice(Device):
         if self.frame == "world":
             R_tool_hand = observation.T_world_tool[:3, :3].T @ self._views.R_world_hand
         wanted = np.concatenate([R_tool_hand @ wanted[:3], R_tool_hand @ wanted[3:]])
-        dt = 1.0 / CONTROL_HZ
-        self._velocity = self._velocity + (dt / (_REACTION + dt)) * (wanted - self._velocity)
+        self._velocity = self._velocity + (self._dt / (_REACTION + self._dt)) * (
+            wanted - self._velocity
+        )
         if not wanted.any() and np.abs(self._velocity).max() < _STILL:
             self._velocity = np.zeros(6)
         return TeleopCommand(self._velocity, self.gripper)
