@@ -21,7 +21,6 @@ from torch import Tensor
 
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
-    CameraRecord,
     Demonstration,
     Steps,
     actions_from_commands,
@@ -282,23 +281,22 @@ def _trajectories(
     """
     shown: list[tuple[Demonstration, int, Array]] = []
     n_yielded = 0
+    reference = dataset.sources[0].demonstration.steps
     for source in dataset.sources:
-        demonstration = source.demonstration
-        actions = demonstration.actions
+        demonstration, actions = source.demonstration, source.demonstration.actions
+        _check_same_cameras(source.name, demonstration.steps, reference, cameras)
         shown.append((demonstration, n_yielded, actions))
         yield demonstration.steps, np.arange(0), actions
         n_yielded += len(demonstration)
-    for i, (entry, episode) in enumerate(zip(dataset.index, dataset, strict=True)):
+    for i, episode in enumerate(dataset):
         t_star = episode.provenance.t_star
-        demonstration, first, actions = shown[entry.source]
+        demonstration, first, actions = shown[dataset.index[i].source]
         if not 0 <= t_star < len(demonstration):
             raise Mismatch(
                 f"episode {i} rejoins at step {t_star} of a demonstration of "
                 f"{len(demonstration)} steps; generate again"
             )
-        for camera in cameras:
-            reference = demonstration.steps.cameras[camera]
-            _check_same_camera(i, camera, episode.steps.cameras.get(camera), reference)
+        _check_same_cameras(f"episode {i}", episode.steps, reference, cameras)
         # `episode.actions(demonstration)`, of which those from t* on are known already.
         n = len(episode)
         commanded, gripper = episode.commands(demonstration)
@@ -312,21 +310,23 @@ def _clipped(n: int, around: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.clip(np.arange(n)[:, None] + around, 0, n - 1)
 
 
-def _check_same_camera(
-    i: int, name: str, camera: CameraRecord | None, reference: CameraRecord
+def _check_same_cameras(
+    what: str, steps: Steps, reference: Steps, cameras: tuple[str, ...]
 ) -> None:
-    if camera is None:
-        raise Mismatch(f"episode {i} has no images of camera {name!r}; generate again with it")
-    if (
-        camera.rgb.shape[1:] != reference.rgb.shape[1:]
-        or not np.allclose(camera.intrinsics, reference.intrinsics)
-        or camera.frame != reference.frame
-        or not np.allclose(camera.T_frame_camera, reference.T_frame_camera, rtol=0, atol=1e-5)
-    ):
-        raise Mismatch(
-            f"episode {i}: camera {name!r} has another size, intrinsics or mounting than in the "
-            "demonstration; generate again with the same camera"
-        )
+    for name in cameras:
+        expected, camera = reference.cameras[name], steps.cameras.get(name)
+        if camera is None:
+            raise Mismatch(f"{what} has no images of camera {name!r}; generate again with it")
+        if (
+            camera.rgb.shape[1:] != expected.rgb.shape[1:]
+            or not np.allclose(camera.intrinsics, expected.intrinsics)
+            or camera.frame != expected.frame
+            or not np.allclose(camera.T_frame_camera, expected.T_frame_camera, rtol=0, atol=1e-5)
+        ):
+            raise Mismatch(
+                f"{what}: camera {name!r} has another size, intrinsics or mounting than in "
+                "the first demonstration; generate again with the same camera"
+            )
 
 
 def _weighted_moments(

@@ -262,11 +262,12 @@ def test_the_first_failures_are_handed_to_the_film_maker(evaluate, short_task, t
     ]
     assert read_json(out)["videos"] == result["videos"]
     paths = [tmp_path / "e" / row["path"] for row in result["videos"]]
-    assert [(path, k, outcome) for path, _, k, outcome in filmed] == [
+    assert [(path, k, outcome) for path, _, _, k, outcome in filmed] == [
         (paths[0], 0, "failure"),
         (paths[1], 1, "failure"),
     ]
-    for _, moments, _, _ in filmed:
+    for _, moments, hz, _, _ in filmed:
+        assert hz == 10
         assert [moment.seconds for moment in moments] == [step / 10 for step in range(7)]
         assert not any(moment.success for moment in moments)
         assert len({moment.overview.shape for moment in moments}) == 1

@@ -70,7 +70,12 @@ def make_steps(
 
 
 def make_dataset(
-    path: Path, t_stars: tuple[int, ...] = (3, 5, 5), n: int = 9, segment: int = 4, seed: int = 0
+    path: Path,
+    t_stars: tuple[int, ...] = (3, 5, 5),
+    n: int = 9,
+    segment: int = 4,
+    seed: int = 0,
+    size: int = 32,
 ) -> Dataset:
     """A demonstration of `n` steps and an episode that rejoins it at each of `t_stars`."""
     rng = np.random.default_rng(seed)
@@ -79,7 +84,7 @@ def make_dataset(
         task_parameters={"gain": GAIN},
         robot="none",
         backend="synthetic",
-        steps=make_steps(n, rng),
+        steps=make_steps(n, rng, size=size),
         timestamps=np.arange(n) / 10,
         body_Ts_world={},
         success=np.zeros(n, bool),
@@ -94,7 +99,7 @@ def make_dataset(
     annotation = Annotation((PrecisionSphere(0, key, 0.05),), demonstration.content_hash())
     episodes = tuple(
         Episode(
-            make_steps(segment, rng, demonstration.steps.commanded_Ts_world_tool[t_star]),
+            make_steps(segment, rng, demonstration.steps.commanded_Ts_world_tool[t_star], size),
             Provenance(demonstration.content_hash(), 0, 0, k, t_star, key, seed, "sart", "paper"),
         )
         for k, t_star in enumerate(t_stars)
@@ -112,16 +117,6 @@ def perturbed(steps: Steps) -> Steps:
         measured_Ts_world_tool=pose((5, 5, 5), (0, 0, 1)) @ steps.measured_Ts_world_tool,
         contact_force=steps.contact_force + 7.0,
     )
-
-
-def add_overview(steps: Steps, size: tuple[int, int] = (24, 36)) -> Steps:
-    """The steps seen by a second camera with other, rectangular images."""
-    wrist = steps.cameras["wrist"]
-    rgb = np.resize(wrist.rgb, (len(wrist.rgb), *size, 3))
-    overview = CameraRecord(
-        rgb, np.zeros(rgb.shape[:3], np.float32), np.eye(3), pose((0.0, 0.0, 1.0))
-    )
-    return dataclasses.replace(steps, cameras={**steps.cameras, "overview": overview})
 
 
 def with_steps(path: Path, dataset: Dataset, change: Callable[[Steps], Steps]) -> Dataset:
@@ -180,8 +175,18 @@ def dataset(make_dataset: Callable[..., Dataset]) -> Dataset:
 
 
 @pytest.fixture
-def two_cameras(dataset: Dataset, tmp_path: Path) -> Dataset:
-    return with_steps(tmp_path / "two_cameras", dataset, add_overview)
+def two_cameras(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """The dataset seen by a second camera too, with other, rectangular images."""
+
+    def add(steps: Steps) -> Steps:
+        wrist = steps.cameras["wrist"]
+        rgb = np.resize(wrist.rgb, (len(wrist.rgb), 24, 36, 3))
+        overview = CameraRecord(
+            rgb, np.zeros(rgb.shape[:3], np.float32), np.eye(3), "world", pose((0.0, 0.0, 1.0))
+        )
+        return dataclasses.replace(steps, cameras={**steps.cameras, "overview": overview})
+
+    return with_steps(tmp_path_factory.mktemp("dataset"), dataset, add)
 
 
 @pytest.fixture

@@ -273,37 +273,76 @@ def test_an_unknown_camera_is_refused_with_the_nearest(dataset, open_windows):
         open_windows(dataset, cameras=("wirst",))
 
 
-def _with_last(path, dataset, steps=None, **provenance):
-    *others, last = dataset
-    changed = dataclasses.replace(
-        last,
-        steps=steps or last.steps,
-        provenance=dataclasses.replace(last.provenance, **provenance),
-    )
-    (source,) = dataset.sources
-    sources = [(source.demonstration, source.annotation)]
-    return write_dataset(path, sources, [*others, changed], {})
+@pytest.fixture
+def two_sources(make_dataset, tmp_path_factory):
+    """Two demonstrations and an episode of each; the second's images may have another size."""
+
+    def two_sources(size=32):
+        episodes, sources = [], []
+        for i, t_star in enumerate((3, 5)):
+            dataset = make_dataset((t_star,), seed=i, size=(32, size)[i])
+            sources += [(source.demonstration, source.annotation) for source in dataset.sources]
+            (episode,) = dataset
+            provenance = dataclasses.replace(episode.provenance, source=i)
+            episodes.append(dataclasses.replace(episode, provenance=provenance))
+        return write_dataset(tmp_path_factory.mktemp("two"), sources, episodes, {})
+
+    return two_sources
 
 
-def test_an_episode_of_another_demonstration_is_refused(dataset, open_windows, tmp_path):
-    with pytest.raises(Mismatch, match="sphere00_k00002.h5 was generated from another demo"):
-        open_windows(_with_last(tmp_path, dataset, demonstration_hash="0"))
+def test_each_episode_is_followed_by_its_own_demonstration(two_sources, open_windows):
+    windows = open_windows(two_sources())
+    # Demonstrations 0..8 and 9..17, their episodes' segments 18..21 and 22..25.
+    assert windows.n_trajectories == 4 and len(windows.gripper) == 26
+    histories = windows.history.tolist()
+    assert [21, 3] in histories and [25, 9 + 5] in histories and [9, 9] in histories
+    assert [8, 9] not in histories
+
+
+def test_demonstrations_seen_by_different_cameras_are_refused(two_sources, open_windows):
+    with pytest.raises(Mismatch, match="demo01: camera 'wrist' has another size, intrinsics or"):
+        open_windows(two_sources(size=24))
+
+
+@pytest.fixture
+def with_last(tmp_path_factory):
+    """The dataset with its last episode changed."""
+
+    def with_last(dataset, steps=None, **provenance):
+        *others, last = dataset
+        changed = dataclasses.replace(
+            last,
+            steps=steps or last.steps,
+            provenance=dataclasses.replace(last.provenance, **provenance),
+        )
+        (source,) = dataset.sources
+        sources = [(source.demonstration, source.annotation)]
+        return write_dataset(tmp_path_factory.mktemp("other"), sources, [*others, changed], {})
+
+    return with_last
+
+
+def test_an_episode_of_another_demonstration_is_refused(dataset, with_last, open_windows):
+    with pytest.raises(
+        Mismatch, match="sphere00_k00002.h5 was generated from another demonstration"
+    ):
+        open_windows(with_last(dataset, demonstration_hash="0"))
 
 
 @pytest.mark.parametrize("t_star", [-1, 9])
-def test_an_episode_that_rejoins_nowhere_is_refused(dataset, t_star, open_windows, tmp_path):
+def test_an_episode_that_rejoins_nowhere_is_refused(dataset, t_star, with_last, open_windows):
     with pytest.raises(Mismatch, match=f"episode 2 rejoins at step {t_star} of a demonstration"):
-        open_windows(_with_last(tmp_path, dataset, t_star=t_star))
+        open_windows(with_last(dataset, t_star=t_star))
 
 
-def test_an_episode_without_the_camera_is_refused(dataset, open_windows, tmp_path):
+def test_an_episode_without_the_camera_is_refused(dataset, with_last, open_windows):
     steps = dataclasses.replace(dataset.episode(2).steps, cameras={})
     with pytest.raises(Mismatch, match="episode 2 has no images of camera 'wrist'"):
-        open_windows(_with_last(tmp_path, dataset, steps))
+        open_windows(with_last(dataset, steps))
 
 
 @pytest.mark.parametrize("field", ["intrinsics", "T_frame_camera", "size"])
-def test_an_episode_seen_by_another_camera_is_refused(dataset, field, open_windows, tmp_path):
+def test_an_episode_seen_by_another_camera_is_refused(dataset, field, with_last, open_windows):
     steps = dataset.episode(2).steps
     camera = steps.cameras["wrist"]
     if field == "size":
@@ -314,4 +353,4 @@ def test_an_episode_seen_by_another_camera_is_refused(dataset, field, open_windo
         camera = dataclasses.replace(camera, **{field: value})
     steps = dataclasses.replace(steps, cameras={"wrist": camera})
     with pytest.raises(Mismatch, match="episode 2: camera 'wrist' has another size, intrinsics or"):
-        open_windows(_with_last(tmp_path, dataset, steps))
+        open_windows(with_last(dataset, steps))
