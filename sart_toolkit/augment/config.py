@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sart_toolkit.augment.strategies import get_strategy
+from sart_toolkit.augment import STRATEGIES, get_strategy
+from sart_toolkit.augment.strategies import Strategy
 from sart_toolkit.collision.demonstrated import GRASP_PLAY
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
+from sart_toolkit.registry import lasting_reference
 
 SHARES = ("radius", "equal")
 
@@ -25,12 +27,12 @@ class AugmentConfig:
     paper. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
     proved to keep `margin` [m] free, even if what is carried moves by `grasp_play` [m] in the
     grasp; if any point of it moves farther the segment is rejected. `camera`: whose pictures are
-    recorded, `None` for none.
+    recorded, `None` for none. `strategy` may be given as an object; its reference is kept.
     """
 
     n: int = 40
     share: str = "radius"
-    strategy: str = "sart"
+    strategy: str | Strategy = "sart"
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     duration: float = 2.0
     margin: float = 0.0002
@@ -51,6 +53,8 @@ class AugmentConfig:
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidInput(f"{name}: expected a finite number >= 0 m, got {value}")
         get_strategy(self.strategy)
+        reference = lasting_reference("strategy", self.strategy, STRATEGIES)
+        object.__setattr__(self, "strategy", reference)
 
     def quotas(self, radii: Sequence[float]) -> list[int]:
         """How many of the n - 1 trajectories spheres of the given radii [m] get.

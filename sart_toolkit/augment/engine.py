@@ -256,6 +256,7 @@ def _finish(
         "seconds": seconds,
         "simulated_seconds": len(outcomes) * request["config"]["duration"],
         "config": request["config"],
+        "references": dict(demonstration.references),
         "content_hash": dataset.content_hash(),
         "versions": library_versions(),
         "episodes": names,

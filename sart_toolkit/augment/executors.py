@@ -100,7 +100,7 @@ class SegmentMaker:
             t_star=t_star,
             T_world_sampled=proposal.T_world_sampled,
             seed=self._config.seed,
-            strategy=self._config.strategy,
+            strategy=str(self._config.strategy),
             law=self._config.sampling.law,
             certificate=proof,
         )

@@ -1,6 +1,6 @@
 """Where an augmented segment leads from and to, and whether its path may bend.
 
-A new strategy is one function and one line in `STRATEGIES`.
+A new strategy is one `Strategy` of a function, and one line in `augment.STRATEGIES`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ import numpy as np
 
 from sart_toolkit.data.records import Demonstration, PrecisionSphere, convergence_waypoint
 from sart_toolkit.data.sampling import SamplingConfig, sample_in_region, sample_pose
-from sart_toolkit.errors import unknown_name
-from sart_toolkit.motion.planning import check_planner
 from sart_toolkit.poses import Array, frozen
 
 
@@ -77,19 +75,5 @@ def sart_planned(
     return Proposal(convergence_waypoint(demonstration, sphere), draw(sphere, rng, config))
 
 
-STRATEGIES = {"sart": Strategy(sart), "sart_planned": Strategy(sart_planned, plans=True)}
-
-
-def get_strategy(name: str) -> Strategy:
-    """The strategy called `name`.
-
-    Raises:
-        UnknownName: no such strategy; the message offers the nearest.
-        MissingExtra: it plans, and OMPL isn't installed.
-    """
-    if name not in STRATEGIES:
-        raise unknown_name("strategy", name, STRATEGIES)
-    strategy = STRATEGIES[name]
-    if strategy.plans:
-        check_planner()
-    return strategy
+SART = Strategy(sart)
+SART_PLANNED = Strategy(sart_planned, plans=True)

@@ -196,7 +196,8 @@ class Demonstration:
     touched since the step before (none where the backend can't tell); `raw_commands (M, 7)`: the
     operator's 30 Hz tool velocity (xyz [m/s], rotation [rad/s], tool frame) and gripper target;
     `states`: the backend's portable state at each step (empty where it has none); `seconds`:
-    wall-clock time the person spent.
+    wall-clock time the person spent; `references`: how "robot", "task" and "backend" are found
+    again (`registry.resolve`), where they are known by more than their name.
     """
 
     task: str
@@ -215,6 +216,7 @@ class Demonstration:
     seconds: float
     seed: int | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
+    references: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.steps)
@@ -253,6 +255,11 @@ class Demonstration:
         return actions_from_commands(
             self.steps.commanded_Ts_world_tool, self.steps.commanded_gripper
         )
+
+    def reference(self, kind: Literal["robot", "task", "backend"]) -> str:
+        """What names the robot, task or backend: its noted reference, or else its name."""
+        name: str = getattr(self, kind)
+        return self.references.get(kind, name)
 
     def content_hash(self) -> str:
         """SHA-256 over what was shown: steps, commands, task, robot; not states or clock time."""

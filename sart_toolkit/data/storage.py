@@ -396,6 +396,7 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
                 "seconds": d.seconds,
                 "seed": d.seed,
                 "versions": dict(d.versions),
+                "references": dict(d.references),
                 "content_hash": d.content_hash(),
             }
         )

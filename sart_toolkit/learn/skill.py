@@ -41,7 +41,8 @@ _FEW_GRIPPER_COMMANDS = 4
 class SkillConfig:
     """What must be known to execute a skill elsewhere.
 
-    The task and its parameters, robot and backend it was shown on; the camera by name, its
+    The task and its parameters, robot and backend it was shown on, and the references that find
+    these again (as in `Demonstration`); the camera by name, its
     recorded `(height, width)` [pixels], `intrinsics (3, 3)` and `T_tool_camera (4, 4)`; the
     demonstration's content hash; and how it was trained.
     """
@@ -56,6 +57,7 @@ class SkillConfig:
     T_tool_camera: Array
     demonstration_hash: str
     training: TrainConfig
+    references: Mapping[str, str]
 
     def __post_init__(self) -> None:
         size = tuple(self.recorded_size)
@@ -76,6 +78,7 @@ class SkillConfig:
             "intrinsics": self.intrinsics.tolist(),
             "T_tool_camera": self.T_tool_camera.tolist(),
             "training": self.training.to_json(),
+            "references": dict(self.references),
         }
 
     @classmethod
@@ -202,6 +205,7 @@ def save_skill(
         T_tool_camera=camera.T_tool_camera,
         demonstration_hash=demonstration.content_hash(),
         training=result.config,
+        references=demonstration.references,
     )
     storage.save_demonstration(path / "demo.h5", demonstration)
     storage.save_annotation(path / "annotation.json", dataset.annotation)

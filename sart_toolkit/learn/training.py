@@ -23,10 +23,12 @@ from sart_toolkit.data.records import Dataset
 from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
 from sart_toolkit.learn.model import Policy
-from sart_toolkit.learn.policies import get_encoder
+from sart_toolkit.learn.policies import POLICIES, get_encoder
+from sart_toolkit.learn.policies.encoder import Encoder
 from sart_toolkit.learn.samples import build_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.poses import check_positive
+from sart_toolkit.registry import lasting_reference
 
 CHECKPOINT = "checkpoint.safetensors"
 _CHECKPOINT_SECONDS = 30.0
@@ -46,10 +48,11 @@ class TrainConfig:
     `image_shift` pixels at random. `hidden`: width of the head. `norm`: the encoder's normalisation
     layers. `backbone_weights`: a file of weights to start from. `bfloat16`: "auto", "on" or "off".
     `device`: "auto", "cpu" or "cuda". `threads`: torch's threads, its own choice if None. `seed`
-    decides the initial weights, the order and the shifts.
+    decides the initial weights, the order and the shifts. `policy` may be given as a class; its
+    reference is kept.
     """
 
-    policy: str
+    policy: str | type[Encoder]
     epochs: int
     batch_size: int
     lr: float
@@ -69,6 +72,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         encoder = get_encoder(self.policy)
+        object.__setattr__(self, "policy", lasting_reference("policy", self.policy, POLICIES))
         for name, least in (
             ("epochs", 1),
             ("batch_size", 2),
@@ -102,7 +106,7 @@ class TrainConfig:
                 )
 
     @classmethod
-    def for_policy(cls, policy: str, **overrides: Any) -> TrainConfig:
+    def for_policy(cls, policy: str | type[Encoder], **overrides: Any) -> TrainConfig:
         """The options that suit a policy, some of them replaced.
 
         Raises:

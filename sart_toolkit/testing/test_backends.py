@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sart_toolkit.backends import get_backend
 from sart_toolkit.backends.interface import Capabilities
 from sart_toolkit.errors import InvalidInput, MissingCapability, UnknownName
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.scenes.spec import Body, SceneSpec, SceneState
-from sart_toolkit.testing.bench import Bench, find_backend
+from sart_toolkit.testing.bench import Bench
 
 Make = Callable[..., Bench]
 _ABILITIES = ("can_restore", "has_contacts", "renders", "observes_bodies")
@@ -20,7 +21,7 @@ _ABILITIES = ("can_restore", "has_contacts", "renders", "observes_bodies")
 
 def test_capabilities_are_known_before_connecting(target: tuple[str, str]) -> None:
     """They are an attribute of the class, and so is its name."""
-    backend = find_backend(target[0])
+    backend = get_backend(target[0])
     assert isinstance(backend.name, str)
     assert isinstance(backend.capabilities, Capabilities)
 
@@ -86,7 +87,7 @@ def test_two_instances_are_independent(bench: Bench, another: Make) -> None:
 def test_closing_twice_does_nothing(bench: Bench) -> None:
     """So that a `finally` may close what was closed."""
     before = bench.digest()
-    made = find_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16)
+    made = get_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16)
     made.close()
     made.close()
     assert bench.digest() == before
@@ -94,7 +95,7 @@ def test_closing_twice_does_nothing(bench: Bench) -> None:
 
 def test_closing_one_instance_leaves_others_alone(bench: Bench) -> None:
     """Neither the first close nor the second reaches somebody else's simulator."""
-    make = find_backend(bench.backend_name)
+    make = get_backend(bench.backend_name)
     made, kept = (make(bench.backend.robot, bench.scene, 16) for _ in range(2))
     kept.reset(bench.state())
     made.close()

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sart_toolkit.backends import get_backend
 from sart_toolkit.backends.interface import CameraView
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import Array, inverse, pose
-from sart_toolkit.testing.bench import Bench, find_backend
+from sart_toolkit.testing.bench import Bench
 from sart_toolkit.testing.scenes import DOT_OFFSET, DOT_THICKNESS, ROOM_HALF_WIDTH
 
 _SIZE = 128
@@ -189,7 +190,7 @@ def test_pictures_show_bodies_where_they_are_now(view: Bench) -> None:
 def test_a_picture_without_pixels_is_refused(view: Bench, size: int) -> None:
     """When it is made and when it is asked for."""
     with pytest.raises(InvalidInput, match="image_size"):
-        find_backend(view.backend_name)(view.backend.robot, view.scene, size)
+        get_backend(view.backend_name)(view.backend.robot, view.scene, size)
     with pytest.raises(InvalidInput, match="image_size"):
         view.see((_wrist(view),), size)
 

@@ -5,8 +5,12 @@ A new policy is one file with an `Encoder` and one line in `POLICIES`.
 
 from __future__ import annotations
 
-from sart_toolkit.learn.policies.encoder import Encoder
-from sart_toolkit.registry import lookup
+from typing import TYPE_CHECKING
+
+from sart_toolkit.registry import expect_class, resolve
+
+if TYPE_CHECKING:
+    from sart_toolkit.learn.policies.encoder import Encoder
 
 POLICIES = {
     "compact_mlp": "sart_toolkit.learn.policies.compact_mlp:CompactEncoder",
@@ -14,12 +18,12 @@ POLICIES = {
 }
 
 
-def get_encoder(policy: str) -> type[Encoder]:
-    """The encoder class of the policy called `policy`.
+def get_encoder(policy: str | type[Encoder]) -> type[Encoder]:
+    """The encoder class that a policy's name or reference names; a class itself is returned.
 
     Raises:
-        UnknownName: no such policy; the message offers the nearest.
+        UnknownName: there is none; the message says which part is wrong.
     """
-    encoder = lookup("policy", policy, POLICIES)
-    assert issubclass(encoder, Encoder)
-    return encoder
+    from sart_toolkit.learn.policies.encoder import Encoder
+
+    return expect_class("policy", policy, resolve("policy", policy, POLICIES), Encoder)
