@@ -11,9 +11,9 @@ from sart_toolkit.cli.arguments import Doctor
 from sart_toolkit.cli.console import show
 
 
-def run_doctor(args: Doctor) -> None:
-    """Print the findings, and exit with 1 where something required does not work."""
-    findings = doctor.diagnose()
+def doctor_verb(args: Doctor) -> dict[str, Any]:
+    """`sart doctor`; exits with 1 where something required does not work."""
+    findings = doctor.diagnose(args.full)
     usable = all(finding.ok for finding in findings if finding.required)
     result: dict[str, Any] = {"usable": usable}
     if args.json:
@@ -23,6 +23,9 @@ def run_doctor(args: Doctor) -> None:
             mark = "ok  " if finding.ok else ("FAIL" if finding.required else "off ")
             remedy = f"\n      -> {finding.remedy}" if finding.remedy and not finding.ok else ""
             result[f"{mark} {finding.name}"] = f"{finding.detail}{remedy}"
-    show(result, args.json)
+        if not args.full:
+            result["more"] = "`sart doctor --full` also tries out what is only looked for here"
     if not usable:
+        show(result, args.json)
         sys.exit(1)
+    return result

@@ -2,36 +2,41 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from sart_toolkit.backends.interface import Backend
 from sart_toolkit.cli.arguments import Record
 from sart_toolkit.cli.console import say
 from sart_toolkit.data.records import CONTROL_HZ, Demonstration
 from sart_toolkit.data.storage import append_json_line, check_writable, remove, save_demonstration
-from sart_toolkit.errors import Discarded, InvalidInput, MissingCapability, NoDisplay
+from sart_toolkit.errors import Discarded, MissingCapability, NoDisplay
 from sart_toolkit.motion.controller import ControllerConfig
 from sart_toolkit.record.desk import RecordingDesk
 from sart_toolkit.record.devices.manual import ManualDevice
 from sart_toolkit.record.screen import Screen, start_sdl
-from sart_toolkit.record.session import SessionConfig, TeleopSession
+from sart_toolkit.record.session import DeviceSetup, SessionConfig, TeleopSession
 from sart_toolkit.record.window import RecordingWindow
-from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.tasks.task import Placement
 
 
 def record_by_hand(
     args: Record,
-    backend: Backend,
-    task: Task,
-    model: RobotModel,
+    setup: DeviceSetup,
     device: ManualDevice,
     placement: Placement,
+    config: SessionConfig,
 ) -> Demonstration:
     """The demonstration that a person steered and saved at `args.out`.
+
+    Args:
+        args: what was typed.
+        setup: what the device was made for.
+        device: what is held.
+        placement: where the object stands.
+        config: how it is recorded; how it ends and how joints are limited is decided here.
 
     Raises:
         Discarded: the person threw it away.
@@ -40,6 +45,8 @@ def record_by_hand(
         NoDisplay: no window can be opened.
         MissingExtra: a library isn't installed.
     """
+
+    backend, task = setup.backend, setup.task
 
     def save(demonstration: Demonstration) -> None:
         check_writable(args.out, args.overwrite)
@@ -63,13 +70,13 @@ def record_by_hand(
         robot = backend.robot
         # No joint goes faster than it can, so nothing jumps near the edge of what can be reached.
         slowest = float(np.min(robot.velocity_limits)) / CONTROL_HZ
-        config = SessionConfig(
+        config = dataclasses.replace(
+            config,
             cameras=(robot.wrist_camera.name,),
-            max_seconds=args.max_seconds,
             end_on_success=True,
             controller=ControllerConfig(max_joint_step=slowest),
         )
-        session = TeleopSession(backend, task, model, placement, config)
+        session = TeleopSession(backend, task, setup.model, placement, config)
         desk = RecordingDesk(session, device, save, watch)
         with Screen(f"sart record {task.name}") as screen:
             RecordingWindow(desk, screen, str(args.out)).run()
@@ -84,18 +91,3 @@ def record_by_hand(
     if desk.demonstration is None:
         raise Discarded("the recording was discarded, nothing was written; record again")
     return desk.demonstration
-
-
-def check_hand_options(args: Record, interactive: bool) -> None:
-    """Refuse options that mean nothing to a script.
-
-    Raises:
-        InvalidInput: one was given.
-    """
-    if interactive:
-        return
-    for name in ("frame", "operator", "status"):
-        if getattr(args, name) is not None:
-            raise InvalidInput(
-                f"--{name}: is for a device that a person holds; add --device keyboard, say"
-            )

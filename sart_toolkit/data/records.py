@@ -187,8 +187,26 @@ class Steps:
         return parts
 
 
+class Referring:
+    """What was made with a robot, on a task and a backend, and says how to find these again.
+
+    `robot`, `task`, `backend` are their names; `references` may hold for each of these words what
+    `registry.resolve` finds it by.
+    """
+
+    robot: str
+    task: str
+    backend: str
+    references: Mapping[str, str]
+
+    def reference(self, kind: Literal["robot", "task", "backend"]) -> str:
+        """What finds the robot, task or backend: its noted reference, or else its name."""
+        name: str = getattr(self, kind)
+        return self.references.get(kind, name)
+
+
 @dataclass(frozen=True)
-class Demonstration:
+class Demonstration(Referring):
     """One demonstration: its 10 Hz steps, the bodies, and what it takes to start from any step.
 
     `timestamps (T,)` [s]; `body_Ts_world` maps body names to `(T, 4, 4)` (empty on hardware);
@@ -196,8 +214,7 @@ class Demonstration:
     touched since the step before (none where the backend can't tell); `raw_commands (M, 7)`: the
     operator's 30 Hz tool velocity (xyz [m/s], rotation [rad/s], tool frame) and gripper target;
     `states`: the backend's portable state at each step (empty where it has none); `seconds`:
-    wall-clock time the person spent; `references`: how "robot", "task" and "backend" are found
-    again (`registry.resolve`), where they are known by more than their name.
+    wall-clock time the person spent.
     """
 
     task: str
@@ -255,11 +272,6 @@ class Demonstration:
         return actions_from_commands(
             self.steps.commanded_Ts_world_tool, self.steps.commanded_gripper
         )
-
-    def reference(self, kind: Literal["robot", "task", "backend"]) -> str:
-        """What names the robot, task or backend: its noted reference, or else its name."""
-        name: str = getattr(self, kind)
-        return self.references.get(kind, name)
 
     def content_hash(self) -> str:
         """SHA-256 over what was shown: steps, commands, task, robot; not states or clock time."""

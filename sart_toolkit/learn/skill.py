@@ -18,6 +18,7 @@ from sart_toolkit.data.records import (
     Dataset,
     Demonstration,
     Image,
+    Referring,
     library_versions,
 )
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, SartError
@@ -38,11 +39,10 @@ _FEW_GRIPPER_COMMANDS = 4
 
 
 @dataclass(frozen=True)
-class SkillConfig:
+class SkillConfig(Referring):
     """What must be known to execute a skill elsewhere.
 
-    The task and its parameters, robot and backend it was shown on, and the references that find
-    these again (as in `Demonstration`); the camera by name, its
+    The task and its parameters, robot and backend it was shown on; the camera by name, its
     recorded `(height, width)` [pixels], `intrinsics (3, 3)` and `T_tool_camera (4, 4)`; the
     demonstration's content hash; and how it was trained.
     """
