@@ -40,6 +40,7 @@ class Finding:
         detail: what was found, or what went wrong.
         remedy: what to do about it; empty where `ok`.
         required: whether the toolkit is of no use without it.
+        tried: whether it was tried out, and not only found to be installed.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Finding:
     detail: str
     remedy: str = ""
     required: bool = False
+    tried: bool = True
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def _quick_finding(probe: Probe) -> Finding:
         return _broken(
             probe, f"{probe.packages[0]} is not installed", _remedy(probe, "ModuleNotFoundError")
         )
-    return Finding(probe.name, True, f"{_version(*probe.packages)}, installed but not tried")
+    return Finding(probe.name, True, f"{_version(*probe.packages)}, not tried", tried=False)
 
 
 def _is_installed(package: str) -> bool:

@@ -100,6 +100,12 @@ def digest(parts: Mapping[str, Any]) -> str:
     return sha.hexdigest()
 
 
+def summary(record: object, **figures: object) -> str:
+    """A record's repr in a line: its class and the figures that matter, without any array."""
+    inside = ", ".join(f"{name}={value}" for name, value in figures.items())
+    return f"{type(record).__name__}({inside})"
+
+
 @dataclass(frozen=True)
 class CameraRecord:
     """What one camera saw: `rgb (T,H,W,3)` uint8, `depth (T,H,W)` float32 metres (0: nothing hit).
@@ -128,6 +134,10 @@ class CameraRecord:
         object.__setattr__(
             self, "T_tool_camera", frozen(check_pose("T_tool_camera", self.T_tool_camera))
         )
+
+    def __repr__(self) -> str:
+        n, height, width, _ = self.rgb.shape
+        return summary(self, pictures=n, width=width, height=height)
 
 
 @dataclass(frozen=True)
@@ -175,6 +185,10 @@ class Steps:
 
     def __len__(self) -> int:
         return len(self.measured_gripper)
+
+    def __repr__(self) -> str:
+        joints = self.joint_positions.shape[1]
+        return summary(self, steps=len(self), joints=joints, cameras=list(self.cameras))
 
     def content(self) -> dict[str, Any]:
         """The arrays by name, for hashing."""
@@ -265,6 +279,17 @@ class Demonstration(Referring):
 
     def __len__(self) -> int:
         return len(self.steps)
+
+    def __repr__(self) -> str:
+        return summary(
+            self,
+            task=self.task,
+            robot=self.robot,
+            backend=self.backend,
+            operator=self.operator,
+            waypoints=len(self),
+            cameras=list(self.steps.cameras),
+        )
 
     @property
     def actions(self) -> Array:
@@ -381,6 +406,10 @@ class Annotation:
                     "tool pose there; keep it, and move the sphere by changing its waypoint"
                 )
 
+    def __repr__(self) -> str:
+        radii = [f"{sphere.radius * 1e3:.1f} mm" for sphere in self.spheres]
+        return summary(self, waypoints=[s.waypoint for s in self.spheres], radii=radii)
+
 
 def convergence_waypoint(demonstration: Demonstration, sphere: PrecisionSphere) -> int:
     """t*: the first waypoint after the key waypoint that lies outside its sphere (paper, Eq. t*).
@@ -434,6 +463,10 @@ class Episode:
     def __len__(self) -> int:
         return len(self.steps)
 
+    def __repr__(self) -> str:
+        at = self.provenance
+        return summary(self, steps=len(self), sphere=at.sphere, k=at.k, t_star=at.t_star)
+
     def commands(self, demonstration: Demonstration) -> tuple[Array, Array]:
         """Commanded tool poses `(n, 4, 4)` and gripper `(n,)` of the whole joined trajectory."""
         t_star = self.provenance.t_star
@@ -466,6 +499,9 @@ class Dataset:
     annotation: Annotation
     episodes: tuple[Episode, ...]
     info: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return summary(self, task=self.demonstration.task, episodes=len(self.episodes))
 
     def content_hash(self) -> str:
         """SHA-256 over the demonstration and every episode, in order."""

@@ -55,10 +55,10 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One leg of an operator's plan: steer the tool to `T_world_tool (4,4)`, then go on.
+class PlanStep:
+    """One step of an operator's plan: steer the tool to `T_world_tool (4,4)`.
 
-    The leg ends when the tool has been within `tolerance` [m] and `tolerance_deg` for `pause` [s]
+    It ends when the tool has been within `tolerance` [m] and `tolerance_deg` for `pause` [s]
     (while fingers close, for instance). `speed` [m/s] is what a person would choose there;
     `gripper` is the command held throughout. With `through` the operator neither slows down before
     the end nor hesitates after it: a point on a curve.
@@ -109,8 +109,8 @@ class Task(abc.ABC):
         """Why the goal isn't reached now, in a few words with numbers."""
 
     @abc.abstractmethod
-    def plan(self, state: SceneState) -> list[Stage]:
-        """The legs by which a person would steer the tool from the start to the goal."""
+    def plan(self, state: SceneState) -> list[PlanStep]:
+        """The steps by which a person would steer the tool from the start to the goal."""
 
     def achieved(self, success: NDArray[np.bool_]) -> bool:
         """Whether the goal was reached at the end and had been for `hold` seconds.
