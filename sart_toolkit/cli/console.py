@@ -27,6 +27,7 @@ _UNITS = {
     "radii": "task",
     "cloud": "task",
 }
+_PLURALS = {"s": "s", "trajectory": "trajectories"}
 # Where nobody watches a bar, a line is written so often [s].
 _LINE_SECONDS = 10.0
 
@@ -58,7 +59,7 @@ class ProgressDisplay:
             self._show_bar(stage, done, total, text)
         elif time.monotonic() - self._said >= _LINE_SECONDS:
             self._said = time.monotonic()
-            unit = _UNITS[stage] if len(_UNITS[stage]) == 1 else f"{_UNITS[stage]}s"
+            unit = _PLURALS.get(_UNITS[stage], f"{_UNITS[stage]}s")
             amount = f"{done:.0f}" if total is None else f"{done:.0f} of {total:.0f}"
             say(f"{stage}: {amount} {unit}{text and f', {text}'}")
 
