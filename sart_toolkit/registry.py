@@ -81,7 +81,9 @@ def check_known(kind: str, reference: Any, table: Mapping[str, str]) -> None:
         )
     if place.endswith(".py"):
         if not Path(place).is_file():
-            raise UnknownName(f"{kind} {reference!r}: no file {place} from {Path.cwd()}")
+            raise UnknownName(
+                f"{kind} {reference!r}: no file {place} from {Path.cwd()}; be where it is"
+            )
     else:
         _import_from_here()
         # Of `a.b` only whether there is an `a`: more would run its code.

@@ -135,16 +135,15 @@ def test_elsewhere_it_says_what_is_missing_and_takes_another(there, tmp_path, mo
     argv += ["--robot", f"{mine}:ROBOT"]
     assert "name another with --task REF" in refused(capsys, *argv)
     assert said(capsys, *argv, "--task", f"{mine}:Drawer")["spheres"]
-    assert "name another with --task REF" in refused(
-        capsys, "evaluate", there / "skill", "--out", tmp_path / "e.json"
-    )
+    line = refused(capsys, "evaluate", there / "skill", "--out", tmp_path / "e.json")
+    assert "policy 'my_things.py:Encoder': no file my_things.py from" in line
 
 
 def test_what_is_given_in_place_of_the_noted_is_noted_from_then_on(there, tmp_path, capsys):
-    argv = "augment demo.h5 spheres.json --n 2 --backend pybullet --task peg_in_hole --out"
+    argv = "augment demo.h5 spheres.json --n 2 --task peg_in_hole --out"
     said(capsys, *argv.split(), tmp_path / "data")
     noted = load_demonstration(tmp_path / "data" / "demo.h5").references
-    assert noted == {**NOTED, "backend": "pybullet", "task": "peg_in_hole"}
+    assert noted == {**NOTED, "task": "peg_in_hole"}
 
 
 def test_a_skill_runs_on_what_it_notes_or_on_what_is_given(there):

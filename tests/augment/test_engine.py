@@ -12,12 +12,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from sart_toolkit.augment import engine
+from sart_toolkit.augment import STRATEGIES, engine
 from sart_toolkit.augment.config import SHARES, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.executors import KEPT, Attempt, SegmentMaker
 from sart_toolkit.augment.planner import SegmentPlanner
-from sart_toolkit.augment.strategies import STRATEGIES
 from sart_toolkit.backends.interface import Backend, Capabilities, Contact
 from sart_toolkit.data.records import (
     Annotation,
@@ -63,7 +62,7 @@ def crowded_dataset(peg_demonstration, crowded, make_peg_backend, tmp_path_facto
 def strategy_dataset(
     request, peg_demonstration, peg_annotation, make_peg_backend, tmp_path_factory
 ):
-    if STRATEGIES[request.param].plans:
+    if request.param == "sart_planned":
         pytest.importorskip("ompl")
     out = tmp_path_factory.mktemp(request.param) / "dataset"
     config = AugmentConfig(n=9, strategy=request.param)

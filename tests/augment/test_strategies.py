@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from sart_toolkit.augment import get_strategy
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.strategies import STRATEGIES, get_strategy, sart, sart_planned
+from sart_toolkit.augment.strategies import SART, SART_PLANNED, sart, sart_planned
 from sart_toolkit.data.records import Demonstration, PrecisionSphere, Steps, convergence_waypoint
 from sart_toolkit.data.sampling import LAWS, SamplingConfig, sample_direction, sample_rotation
 from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
@@ -174,12 +175,10 @@ def test_a_demonstration_that_never_leaves_a_sphere_is_joined_at_its_last_waypoi
     assert convergence_waypoint(demonstration, PrecisionSphere(2, pose(), 0.1)) == 7
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("strategy", [SART, SART_PLANNED])
 def test_every_strategy_rejoins_ahead_of_its_sphere_and_follows_from_the_rng(
-    name, peg_demonstration, peg_annotation
+    strategy, peg_demonstration, peg_annotation
 ):
-    # Drawing needs no planner: `get_strategy` would ask for it.
-    strategy = STRATEGIES[name]
     for sphere in peg_annotation.spheres:
         drawn = [
             strategy(peg_demonstration, sphere, np.random.default_rng(3), SamplingConfig())
@@ -238,13 +237,10 @@ def test_in_a_ball_the_strategy_that_plans_draws_what_the_paper_s_does(law):
 
 
 def test_only_the_planned_strategy_plans_and_either_may_be_called():
-    assert {name: strategy.plans for name, strategy in STRATEGIES.items()} == {
-        "sart": False,
-        "sart_planned": True,
-    }
+    assert not SART.plans and SART_PLANNED.plans
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
     sphere = PrecisionSphere(0, pose(), 0.2)
-    for strategy in STRATEGIES.values():
+    for strategy in (SART, SART_PLANNED):
         arguments = demonstration, sphere, np.random.default_rng(0), SamplingConfig()
         again = demonstration, sphere, np.random.default_rng(0), SamplingConfig()
         np.testing.assert_array_equal(
