@@ -15,6 +15,7 @@ from sart_toolkit.data.records import RECORD_HZ
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
 
 
@@ -77,8 +78,8 @@ class Task(abc.ABC):
     """A skill to be learned, told without naming a simulator.
 
     Attributes:
-        name: as in `TASKS`.
-        robot: the robot it is made for.
+        name: what it is called in files and reports.
+        robot: the robot it is made for: a name, a reference or the robot itself.
         scene: bodies, held bodies and fixed cameras.
         placement_range: half width [m] of the square that the object is placed in.
         yaw_range_deg: the largest turn [deg] either way that its operator can cope with.
@@ -88,7 +89,7 @@ class Task(abc.ABC):
     """
 
     name: str
-    robot: str
+    robot: str | RobotSpec
     scene: SceneSpec
     placement_range: float
     yaw_range_deg: float = 15.0
