@@ -1,8 +1,10 @@
 """Teach a robot a skill from one demonstration (SART).
 
-The names below are what a skill author needs; they are imported when first used.
+The names below are what the author of a skill, robot, task, backend, strategy or policy needs; they
+are imported when first used.
 """
 
+# ruff: noqa: F401 - what is imported for type checkers is exported by `__getattr__`.
 from __future__ import annotations
 
 import importlib
@@ -10,122 +12,291 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
+    from sart_toolkit.augment import STRATEGIES, get_strategy
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.engine import augment_demonstration, augment_sources
+    from sart_toolkit.augment.executors import SegmentExecutor
     from sart_toolkit.augment.strategies import Proposal, Strategy
     from sart_toolkit.augment.validate import validate_dataset
-    from sart_toolkit.backends import make_backend
-    from sart_toolkit.collision.certificate import certify
+    from sart_toolkit.backends import BACKENDS, get_backend, make_backend
+    from sart_toolkit.backends.interface import (
+        Backend,
+        CameraView,
+        CommandSent,
+        Contact,
+        Draws,
+        KnowsBodies,
+        Observation,
+        Resets,
+        SavesStates,
+        SensesContacts,
+        SensesForce,
+        require,
+    )
+    from sart_toolkit.collision.certificate import Certificate, certify
+    from sart_toolkit.collision.cloud import CloudConfig
     from sart_toolkit.collision.cloud_world import CloudWorld
     from sart_toolkit.collision.exact import ExactWorld
     from sart_toolkit.collision.model import CollisionModel
     from sart_toolkit.collision.world import CollisionWorld, make_world
     from sart_toolkit.data.assets import asset
-    from sart_toolkit.data.dataset import load_dataset
-    from sart_toolkit.data.sampling import SamplingConfig
+    from sart_toolkit.data.dataset import Dataset, load_dataset
+    from sart_toolkit.data.records import (
+        Annotation,
+        CameraRecord,
+        Demonstration,
+        Episode,
+        PrecisionSphere,
+        Provenance,
+        Rates,
+        Steps,
+        convergence_waypoint,
+    )
+    from sart_toolkit.data.sampling import SamplingConfig, sample_pose
     from sart_toolkit.data.storage import (
         load_annotation,
         load_demonstration,
+        load_episode,
         save_annotation,
         save_demonstration,
     )
-    from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
-    from sart_toolkit.learn.skill import load_skill, save_skill
+    from sart_toolkit.errors import (
+        BrokenFile,
+        CannotWrite,
+        DeviceLost,
+        Discarded,
+        InvalidInput,
+        Mismatch,
+        MissingCapability,
+        MissingExtra,
+        MissingFile,
+        MotionRejected,
+        NoDisplay,
+        OutputExists,
+        SartError,
+        UnknownName,
+        Unreachable,
+    )
+    from sart_toolkit.evaluate.rollout import EvaluateConfig, Rollout, evaluate_skill, run_rollout
+    from sart_toolkit.learn.policies import POLICIES, get_policy
+    from sart_toolkit.learn.policy import Policy, PolicySetup
+    from sart_toolkit.learn.skill import Skill, load_skill, save_skill
     from sart_toolkit.learn.training import TrainConfig, train
+    from sart_toolkit.pipeline import run, run_skill
+    from sart_toolkit.poses import inverse, pose
+    from sart_toolkit.record.devices import DEVICES, make_device
     from sart_toolkit.record.replay import replay_demonstration
     from sart_toolkit.record.scripted import ScriptedOperator
-    from sart_toolkit.record.session import record_demonstration
+    from sart_toolkit.record.session import (
+        Device,
+        DeviceSetup,
+        SessionConfig,
+        TeleopCommand,
+        record_demonstration,
+    )
     from sart_toolkit.report.page import write_report
     from sart_toolkit.report.video import film_rollout
-    from sart_toolkit.robots import get_robot
+    from sart_toolkit.robots import ROBOTS, get_robot
     from sart_toolkit.robots.model import RobotModel
-    from sart_toolkit.scenes.appearance import vary_appearance
-    from sart_toolkit.tasks import get_task
-    from sart_toolkit.tasks.task import Placement
+    from sart_toolkit.robots.spec import (
+        Attachment,
+        CameraSpec,
+        GripperSpec,
+        RobotSpec,
+        Shape,
+        look_at,
+    )
+    from sart_toolkit.scenes.appearance import AppearanceConfig, vary_appearance
+    from sart_toolkit.scenes.spec import Body, Detent, Joint, Light, SceneSpec, SceneState
+    from sart_toolkit.tasks import TASKS, get_task
+    from sart_toolkit.tasks.task import Placement, PlanStep, Task
 
+# For each module of ours the names that are exported from it, the same as above.
 _HOMES = {
-    "AugmentConfig": "augment.config",
-    "CloudWorld": "collision.cloud_world",
-    "CollisionModel": "collision.model",
-    "CollisionWorld": "collision.world",
-    "EvaluateConfig": "evaluate.rollout",
-    "ExactWorld": "collision.exact",
-    "Placement": "tasks.task",
-    "Proposal": "augment.strategies",
-    "RobotModel": "robots.model",
-    "SamplingConfig": "data.sampling",
-    "ScriptedOperator": "record.scripted",
-    "Strategy": "augment.strategies",
-    "SuggestConfig": "annotate.suggest",
-    "TrainConfig": "learn.training",
-    "asset": "data.assets",
-    "augment_demonstration": "augment.engine",
-    "augment_sources": "augment.engine",
-    "certify": "collision.certificate",
-    "evaluate_skill": "evaluate.rollout",
-    "film_rollout": "report.video",
-    "get_robot": "robots",
-    "get_task": "tasks",
-    "load_annotation": "data.storage",
-    "load_dataset": "data.dataset",
-    "load_demonstration": "data.storage",
-    "load_skill": "learn.skill",
-    "make_backend": "backends",
-    "make_world": "collision.world",
-    "record_demonstration": "record.session",
-    "replay_demonstration": "record.replay",
-    "save_annotation": "data.storage",
-    "save_demonstration": "data.storage",
-    "save_skill": "learn.skill",
-    "suggest_annotation": "annotate.suggest",
-    "train": "learn.training",
-    "validate_dataset": "augment.validate",
-    "vary_appearance": "scenes.appearance",
-    "write_report": "report.page",
+    "annotate.suggest": (
+        "SuggestConfig",
+        "suggest_annotation",
+    ),
+    "augment": (
+        "STRATEGIES",
+        "get_strategy",
+    ),
+    "augment.config": ("AugmentConfig",),
+    "augment.engine": (
+        "augment_demonstration",
+        "augment_sources",
+    ),
+    "augment.executors": ("SegmentExecutor",),
+    "augment.strategies": (
+        "Proposal",
+        "Strategy",
+    ),
+    "augment.validate": ("validate_dataset",),
+    "backends": (
+        "BACKENDS",
+        "get_backend",
+        "make_backend",
+    ),
+    "backends.interface": (
+        "Backend",
+        "CameraView",
+        "CommandSent",
+        "Contact",
+        "Draws",
+        "KnowsBodies",
+        "Observation",
+        "Resets",
+        "SavesStates",
+        "SensesContacts",
+        "SensesForce",
+        "require",
+    ),
+    "collision.certificate": (
+        "Certificate",
+        "certify",
+    ),
+    "collision.cloud": ("CloudConfig",),
+    "collision.cloud_world": ("CloudWorld",),
+    "collision.exact": ("ExactWorld",),
+    "collision.model": ("CollisionModel",),
+    "collision.world": (
+        "CollisionWorld",
+        "make_world",
+    ),
+    "data.assets": ("asset",),
+    "data.dataset": (
+        "Dataset",
+        "load_dataset",
+    ),
+    "data.records": (
+        "Annotation",
+        "CameraRecord",
+        "Demonstration",
+        "Episode",
+        "PrecisionSphere",
+        "Provenance",
+        "Rates",
+        "Steps",
+        "convergence_waypoint",
+    ),
+    "data.sampling": (
+        "SamplingConfig",
+        "sample_pose",
+    ),
+    "data.storage": (
+        "load_annotation",
+        "load_demonstration",
+        "load_episode",
+        "save_annotation",
+        "save_demonstration",
+    ),
+    "errors": (
+        "BrokenFile",
+        "CannotWrite",
+        "DeviceLost",
+        "Discarded",
+        "InvalidInput",
+        "Mismatch",
+        "MissingCapability",
+        "MissingExtra",
+        "MissingFile",
+        "MotionRejected",
+        "NoDisplay",
+        "OutputExists",
+        "SartError",
+        "UnknownName",
+        "Unreachable",
+    ),
+    "evaluate.rollout": (
+        "EvaluateConfig",
+        "Rollout",
+        "evaluate_skill",
+        "run_rollout",
+    ),
+    "learn.policies": (
+        "POLICIES",
+        "get_policy",
+    ),
+    "learn.policy": (
+        "Policy",
+        "PolicySetup",
+    ),
+    "learn.skill": (
+        "Skill",
+        "load_skill",
+        "save_skill",
+    ),
+    "learn.training": (
+        "TrainConfig",
+        "train",
+    ),
+    "pipeline": (
+        "run",
+        "run_skill",
+    ),
+    "poses": (
+        "inverse",
+        "pose",
+    ),
+    "record.devices": (
+        "DEVICES",
+        "make_device",
+    ),
+    "record.replay": ("replay_demonstration",),
+    "record.scripted": ("ScriptedOperator",),
+    "record.session": (
+        "Device",
+        "DeviceSetup",
+        "SessionConfig",
+        "TeleopCommand",
+        "record_demonstration",
+    ),
+    "report.page": ("write_report",),
+    "report.video": ("film_rollout",),
+    "robots": (
+        "ROBOTS",
+        "get_robot",
+    ),
+    "robots.model": ("RobotModel",),
+    "robots.spec": (
+        "Attachment",
+        "CameraSpec",
+        "GripperSpec",
+        "RobotSpec",
+        "Shape",
+        "look_at",
+    ),
+    "scenes.appearance": (
+        "AppearanceConfig",
+        "vary_appearance",
+    ),
+    "scenes.spec": (
+        "Body",
+        "Detent",
+        "Joint",
+        "Light",
+        "SceneSpec",
+        "SceneState",
+    ),
+    "tasks": (
+        "TASKS",
+        "get_task",
+    ),
+    "tasks.task": (
+        "Placement",
+        "PlanStep",
+        "Task",
+    ),
 }
-__all__ = [
-    "AugmentConfig",
-    "CloudWorld",
-    "CollisionModel",
-    "CollisionWorld",
-    "EvaluateConfig",
-    "ExactWorld",
-    "Placement",
-    "Proposal",
-    "RobotModel",
-    "SamplingConfig",
-    "ScriptedOperator",
-    "Strategy",
-    "SuggestConfig",
-    "TrainConfig",
-    "asset",
-    "augment_demonstration",
-    "augment_sources",
-    "certify",
-    "evaluate_skill",
-    "film_rollout",
-    "get_robot",
-    "get_task",
-    "load_annotation",
-    "load_dataset",
-    "load_demonstration",
-    "load_skill",
-    "make_backend",
-    "make_world",
-    "record_demonstration",
-    "replay_demonstration",
-    "save_annotation",
-    "save_demonstration",
-    "save_skill",
-    "suggest_annotation",
-    "train",
-    "validate_dataset",
-    "vary_appearance",
-    "write_report",
-]
+_MODULES = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,4 +1,4 @@
-"""What works on this machine, and how to mend what does not."""
+"""What works on this machine, and how to fix what does not."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ class Finding:
         detail: what was found, or what went wrong.
         remedy: what to do about it; empty where `ok`.
         required: whether the toolkit is of no use without it.
+        tried: whether it was tried out, and not only found to be installed.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Finding:
     detail: str
     remedy: str = ""
     required: bool = False
+    tried: bool = True
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class Probe:
         remedy: what to do where the function fails, other than for a missing package or library.
         required: whether the toolkit is of no use without it.
         timeout_s: how long it may take [s].
+        packages: for an answer without trying: the installed packages that it needs.
     """
 
     name: str
@@ -68,17 +71,38 @@ class Probe:
     remedy: str = ""
     required: bool = False
     timeout_s: float = 120.0
+    packages: tuple[str, ...] = ()
 
 
-def diagnose() -> list[Finding]:
+def diagnose(full: bool = True) -> list[Finding]:
     """What works on this machine, required things first.
 
     Simulators and renderers are tried out for real, each in a process of its own, so that one
-    that crashes or hangs is a finding and not the end of the doctor.
+    that crashes or hangs is a finding and not the end of the doctor. Unless `full`, of what is not
+    required it is only looked up whether it is installed.
     """
+    probe = run_probe if full else _quick_finding
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        findings = [_python_finding(), _disk_finding(Path.cwd()), *pool.map(run_probe, PROBES)]
+        findings = [_python_finding(), _disk_finding(Path.cwd()), *pool.map(probe, PROBES)]
     return sorted(findings, key=lambda finding: not finding.required)
+
+
+def _quick_finding(probe: Probe) -> Finding:
+    if probe.required:
+        return run_probe(probe)
+    if not any(map(_is_installed, probe.packages)):
+        return _broken(
+            probe, f"{probe.packages[0]} is not installed", _remedy(probe, "ModuleNotFoundError")
+        )
+    return Finding(probe.name, True, f"{_version(*probe.packages)}, not tried", tried=False)
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 def run_probe(probe: Probe) -> Finding:
@@ -415,11 +439,13 @@ PROBES: Sequence[Probe] = (
     Probe(
         "threads",
         "sart_toolkit.doctor:probe_threads",
+        packages=("torch",),
         remedy="set OMP_NUM_THREADS to the number of usable cores",
     ),
     Probe(
         "CUDA",
         "sart_toolkit.doctor:probe_cuda",
+        packages=("torch",),
         remedy="none needed, everything runs on the CPU; for a GPU: NVIDIA's driver, and the "
         "CUDA build of torch 2.13.0",
     ),
@@ -427,12 +453,14 @@ PROBES: Sequence[Probe] = (
         "SAPIEN physics",
         "sart_toolkit.doctor:probe_sapien_physics",
         extra="sapien",
+        packages=("sapien",),
         remedy="reinstall: pip install --force-reinstall sapien==3.0.3",
     ),
     Probe(
         "SAPIEN rendering",
         "sart_toolkit.doctor:probe_sapien_rendering",
         extra="sapien",
+        packages=("sapien",),
         remedy="it needs a GPU's Vulkan driver, or Mesa's from 24.3 on (Debian 12: from "
         f"bookworm-backports); in a checkout: {_SUDO}bash tools/setup_debian.sh sapien",
     ),
@@ -440,12 +468,14 @@ PROBES: Sequence[Probe] = (
         "Open3D off-screen",
         "sart_toolkit.doctor:probe_open3d_offscreen",
         extra="annotate",
+        packages=("open3d-cpu", "open3d"),
         remedy=f"in a checkout: {_SUDO}bash tools/setup_debian.sh annotate",
     ),
     Probe(
         "Open3D window",
         "sart_toolkit.doctor:probe_open3d_window",
         extra="annotate",
+        packages=("open3d-cpu", "open3d"),
         remedy="work on a desktop, or give it a virtual display: xvfb-run -a COMMAND (in a "
         f"checkout, to install that: {_SUDO}bash tools/setup_debian.sh annotate)",
     ),
@@ -453,6 +483,7 @@ PROBES: Sequence[Probe] = (
         "pygame window",
         "sart_toolkit.doctor:probe_teleop_window",
         extra="teleop",
+        packages=("pygame-ce",),
         remedy="work on a desktop, or give it a virtual display: xvfb-run -a COMMAND (in a "
         f"checkout, to install that: {_SUDO}bash tools/setup_debian.sh teleop)",
     ),
@@ -460,6 +491,7 @@ PROBES: Sequence[Probe] = (
         "SpaceMouse",
         "sart_toolkit.doctor:probe_spacemouse",
         extra="teleop",
+        packages=("hidapi",),
         remedy="reinstall: pip install --force-reinstall hidapi; other devices steer as well",
     ),
 )

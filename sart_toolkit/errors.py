@@ -15,7 +15,7 @@ class InvalidInput(SartError, ValueError):
 
 
 class UnknownName(SartError, LookupError):
-    """A name is not in the table it was looked up in."""
+    """A name or reference leads to nothing, or to something of another kind."""
 
 
 class MissingFile(SartError, FileNotFoundError):
@@ -75,6 +75,12 @@ def unknown_name(kind: str, name: str, choices: Iterable[str]) -> UnknownName:
         choices: the names that are.
     """
     choices = sorted(choices)
-    near = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    near = nearest_name(name, choices)
+    hint = f"did you mean {near!r}? " if near else ""
     return UnknownName(f"unknown {kind} {name!r}: {hint}choose from {', '.join(choices)}")
+
+
+def nearest_name(name: str, choices: Iterable[str]) -> str | None:
+    """The choice that a person who typed `name` may have meant; None if none is like it."""
+    near = difflib.get_close_matches(name, list(choices), n=1, cutoff=0.5)
+    return near[0] if near else None

@@ -60,6 +60,24 @@ def test_what_the_tests_run_on_works_and_comes_first(findings: list[Finding]) ->
     assert [finding for finding in required if not finding.ok] == []
 
 
+def test_a_quick_look_tries_only_what_is_required() -> None:
+    started = time.monotonic()
+    findings = diagnose(full=False)
+    assert time.monotonic() - started < 20.0
+    assert {finding.required for finding in findings if finding.tried} == {True}
+    looked_for = {finding.name: finding for finding in findings if not finding.tried}
+    assert "CUDA" in looked_for and "SAPIEN rendering" in looked_for
+    assert looked_for["CUDA"].detail == f"torch {torch.__version__}, not tried"
+
+
+def test_a_quick_look_tells_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    probe = Probe("made up", "made_up:probe", extra="sapien", packages=("no-such", "nor-such"))
+    monkeypatch.setattr(doctor, "PROBES", (probe,))
+    (finding,) = [f for f in diagnose(full=False) if f.name == "made up"]
+    assert not finding.ok and finding.detail == "no-such is not installed"
+    assert "pip install sart_toolkit[sapien]" in finding.remedy
+
+
 def test_a_probe_that_returns_is_ok_with_what_it_returned() -> None:
     finding = run_probe(Probe("made up", "platform:python_implementation", required=True))
     assert finding == Finding("made up", True, "CPython", required=True)

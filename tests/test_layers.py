@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "sart_toolkit"
 LAYERS = (
     "errors",
     "poses",
+    "userfiles",
     "registry",
     "workers",
     "data",
@@ -34,6 +35,7 @@ LAYERS = (
     "doctor",
     "pipeline",
     "cli",
+    "__main__",
 )
 
 # What the lazy tables hold: "sart_toolkit.tasks.peg_in_hole:PegInHole".

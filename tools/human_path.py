@@ -37,7 +37,7 @@ from sart_toolkit.record.devices.manual import SPEEDS, views
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
-from sart_toolkit.tasks.task import Placement, Stage
+from sart_toolkit.tasks.task import Placement, PlanStep
 from sart_toolkit.testing.desktop import Desktop
 
 _SART = (sys.executable, "-c", "from sart_toolkit.cli import main; main()")
@@ -162,7 +162,7 @@ class _Hands:
             time.sleep(0.05)
         return now
 
-    def steer(self, leg: Stage, timeout_s: float = 60.0) -> None:
+    def steer(self, leg: PlanStep, timeout_s: float = 60.0) -> None:
         """Bring the tool to the end of a leg, or until the recording ends by itself."""
         deadline = time.monotonic() + timeout_s
         while (now := self.look())["state"] != "ended":
@@ -179,7 +179,7 @@ class _Hands:
         self._hold(set())
         time.sleep(_LOOK + leg.pause)
 
-    def _keys(self, T_world_tool: Array, leg: Stage) -> tuple[str, set[str]]:
+    def _keys(self, T_world_tool: Array, leg: PlanStep) -> tuple[str, set[str]]:
         """The speed to choose and the keys to hold, so as to come nearer to the end of a leg."""
         motion = relative_motion(T_world_tool, leg.T_world_tool)
         R_hand_tool = self._R_world_hand.T @ T_world_tool[:3, :3]

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.augment.strategies import Strategy, get_strategy, strategy_name
+from sart_toolkit.augment import STRATEGIES, get_strategy
+from sart_toolkit.augment.strategies import Strategy
 from sart_toolkit.collision.phases import IN_GRASP_SLIP
 from sart_toolkit.collision.world import SOURCES, Source
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
+from sart_toolkit.registry import lasting_reference
 
 ALLOCATIONS = ("radius", "equal")
 
@@ -30,6 +32,7 @@ class AugmentConfig:
     the demonstration's cameras saw, even if what is grasped slips by `slip_tolerance` [m]; if any
     point of it moves farther in the grasp the segment is rejected. `cameras`: whose pictures are
     recorded, `None` for those of the demonstration. `executor`: how segments are carried out.
+    `strategy` may be given as an object; its reference is kept.
     """
 
     n: int = 40
@@ -61,18 +64,12 @@ class AugmentConfig:
         get_strategy(self.strategy)
         if self.cameras is not None:
             object.__setattr__(self, "cameras", tuple(self.cameras))
+        reference = lasting_reference("strategy", self.strategy, STRATEGIES)
+        object.__setattr__(self, "strategy", reference)
 
     def to_json(self) -> dict[str, Any]:
-        """The settings as JSON values.
-
-        Raises:
-            InvalidInput: the strategy has no name to note.
-        """
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return values | {
-            "strategy": strategy_name(self.strategy),
-            "sampling": dataclasses.asdict(self.sampling),
-        }
+        """The settings as JSON values."""
+        return dataclasses.asdict(self)
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> AugmentConfig:

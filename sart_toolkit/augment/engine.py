@@ -198,5 +198,6 @@ def _finish(
             "seconds": seconds,
             "simulated_seconds": attempted * config.duration,
             "config": config.to_json(),
+            "references": dict(shown.references),
         }
     )

@@ -11,7 +11,6 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner, path_deviation, world_of
-from sart_toolkit.augment.strategies import strategy_name
 from sart_toolkit.backends.interface import (
     Backend,
     Contact,
@@ -29,7 +28,7 @@ from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.record.recorder import StepRecorder
-from sart_toolkit.registry import lookup
+from sart_toolkit.registry import expect_class, resolve
 from sart_toolkit.scenes.spec import SceneSpec
 
 # By no more than this [m] may any point of a body be moved that isn't grasped.
@@ -168,7 +167,7 @@ class RestoreExecutor(SegmentExecutor):
             t_star=t_star,
             T_world_sampled=proposal.T_world_sampled,
             seed=self._config.seed,
-            strategy=strategy_name(self._config.strategy),
+            strategy=str(self._config.strategy),
             distribution=self._config.sampling.distribution,
             certificate=proof,
         )
@@ -242,12 +241,14 @@ EXECUTORS = {"restore": "sart_toolkit.augment.executors:RestoreExecutor"}
 
 
 def get_executor(name: str) -> type[SegmentExecutor]:
-    """The class of executors that a name stands for.
+    """The class of executors that a name or reference names.
 
     Raises:
-        UnknownName: no such executor; the message offers the nearest.
+        UnknownName: there is none; the message says which part is wrong.
     """
-    found: type[SegmentExecutor] = lookup("executor", name, EXECUTORS)
+    found: type[SegmentExecutor] = expect_class(
+        "executor", name, resolve("executor", name, EXECUTORS), SegmentExecutor
+    )
     return found
 
 

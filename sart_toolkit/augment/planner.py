@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sart_toolkit.augment import get_strategy
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.strategies import Proposal, get_strategy
+from sart_toolkit.augment.strategies import Proposal
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.collision.world import CollisionWorld, make_world

@@ -1,6 +1,6 @@
 """Where an augmented segment leads from and to, and whether its path may bend.
 
-A new strategy is one subclass of `Strategy`; in this package also one line in `STRATEGIES`.
+A new strategy is one subclass of `Strategy`; in this package also one line in `augment.STRATEGIES`.
 """
 
 from __future__ import annotations
@@ -12,10 +12,7 @@ import numpy as np
 
 from sart_toolkit.data.records import Demonstration, PrecisionSphere, convergence_waypoint
 from sart_toolkit.data.sampling import SamplingConfig, sample_in_region, sample_pose
-from sart_toolkit.errors import InvalidInput
-from sart_toolkit.motion.planning import check_planner
 from sart_toolkit.poses import Array, frozen
-from sart_toolkit.registry import lookup
 
 
 @dataclass(frozen=True)
@@ -100,38 +97,3 @@ class SartPlanned(Strategy):
 
 SART = Sart()
 SART_PLANNED = SartPlanned()
-
-STRATEGIES = {
-    "sart": "sart_toolkit.augment.strategies:SART",
-    "sart_planned": "sart_toolkit.augment.strategies:SART_PLANNED",
-}
-
-
-def get_strategy(strategy: str | Strategy) -> Strategy:
-    """The strategy that a name stands for, or the strategy itself.
-
-    Raises:
-        UnknownName: no such strategy; the message offers the nearest.
-        InvalidInput: what the name stands for isn't a strategy.
-        MissingExtra: it plans, and OMPL isn't installed.
-    """
-    found = lookup("strategy", strategy, STRATEGIES) if isinstance(strategy, str) else strategy
-    if not isinstance(found, Strategy):
-        raise InvalidInput(f"strategy: expected a Strategy, got {found!r}; make an instance of one")
-    if found.plans:
-        check_planner()
-    return found
-
-
-def strategy_name(strategy: str | Strategy) -> str:
-    """The name by which files note a strategy.
-
-    Raises:
-        InvalidInput: it has none in `STRATEGIES`.
-    """
-    if isinstance(strategy, str):
-        return strategy
-    for name in STRATEGIES:
-        if lookup("strategy", name, STRATEGIES) is strategy:
-            return name
-    raise InvalidInput(f"strategy: {strategy!r} has no name to note in files; add it to STRATEGIES")

@@ -11,7 +11,6 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner, path_deviation, world_of
-from sart_toolkit.augment.strategies import strategy_name
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.data.dataset import SUMMARY, Dataset, load_dataset
 from sart_toolkit.data.manifest import EpisodeEntry
@@ -119,7 +118,7 @@ class _EpisodeCheck:
             raise MotionRejected("provenance: it is of another attempt than the index says")
         made_with = (
             self._config.seed,
-            strategy_name(self._config.strategy),
+            self._config.strategy,
             self._config.sampling.distribution,
         )
         if (p.seed, p.strategy, p.distribution) != made_with:

@@ -1,15 +1,20 @@
 """Simulators and robots behind one interface (`Backend`).
 
-A new backend is one file and one line in `BACKENDS`.
+A new backend is one file and one line in `BACKENDS`; one outside the repository needs no line,
+`package.module:NAME` or `path/to/file.py:NAME` names it.
 """
 
 from __future__ import annotations
 
-from sart_toolkit.backends.interface import Backend
+from typing import TYPE_CHECKING
+
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
-from sart_toolkit.registry import lookup
-from sart_toolkit.robots.spec import ImageSize, RobotSpec
-from sart_toolkit.scenes.spec import SceneSpec
+from sart_toolkit.registry import expect_class, resolve
+
+if TYPE_CHECKING:
+    from sart_toolkit.backends.interface import Backend
+    from sart_toolkit.robots.spec import ImageSize, RobotSpec
+    from sart_toolkit.scenes.spec import SceneSpec
 
 BACKENDS = {
     "pybullet": "sart_toolkit.backends.pybullet:PyBulletBackend",
@@ -17,25 +22,34 @@ BACKENDS = {
 }
 
 
+def get_backend(backend: str | type[Backend]) -> type[Backend]:
+    """The class that a name or reference names; a class itself is returned.
+
+    Raises:
+        UnknownName: there is none; the message says which part is wrong.
+    """
+    from sart_toolkit.backends.interface import Backend
+
+    return expect_class("backend", backend, resolve("backend", backend, BACKENDS), Backend)
+
+
 def make_backend(
-    name: str,
+    backend: str | type[Backend],
     robot: RobotSpec,
     scene: SceneSpec,
     image_size: ImageSize = 128,
     rates: Rates = DEFAULT_RATES,
 ) -> Backend:
-    """The backend called `name`, with the robot and scene loaded.
+    """A backend with the robot and scene loaded.
 
     Args:
-        name: one of `BACKENDS`.
+        backend: its class, or a name or reference that names it.
         robot: the robot.
         scene: what surrounds it.
         image_size: width and height of pictures [pixels]; one number for a square.
         rates: how often it is commanded, measured and recorded.
 
     Raises:
-        UnknownName: no such backend; the message offers the nearest.
+        UnknownName: no such backend; the message says which part is wrong.
     """
-    made = lookup("backend", name, BACKENDS)(robot, scene, image_size, rates)
-    assert isinstance(made, Backend)
-    return made
+    return get_backend(backend)(robot, scene, image_size, rates)

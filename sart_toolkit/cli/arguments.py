@@ -4,25 +4,58 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-import tyro
 from tyro.conf import Positional, arg
+
+
+def _optional(metavar: str, help: str) -> Any:
+    """A flag that may be left out, what happens then being in its help."""
+    return arg(metavar=metavar, help=help, help_behavior_hint="")
+
 
 _JSON = Annotated[bool, arg(name="json", help="Print the result as one JSON object on stdout.")]
 _OVERWRITE = Annotated[bool, arg(help="Replace what is at the output path.")]
 _TASK = Annotated[
-    Positional[str], arg(metavar="TASK", help="Name of the task, such as peg_in_hole.")
+    Positional[str],
+    arg(metavar="TASK", help="Task, such as peg_in_hole, or your own: drawer.py:Drawer."),
 ]
-_BACKEND = Annotated[str, arg(help="Simulator or robot to run on.")]
-_ROBOT = Annotated[str | None, arg(help="Robot; the task's own if left out.")]
+_BACKEND = Annotated[
+    str, arg(metavar="REF", help="Simulator or robot to run on: pybullet, sapien, or your own.")
+]
+_REF = "a name, module:NAME or file.py:NAME"
+_ROBOT = Annotated[str | None, _optional("REF", f"Robot, as {_REF}; the task's own if left out.")]
+_NOTED_TASK = Annotated[
+    str | None, _optional("REF", f"Task, as {_REF}; what the recording notes if left out.")
+]
+_NOTED_ROBOT = Annotated[
+    str | None, _optional("REF", f"Robot, as {_REF}; what the recording notes if left out.")
+]
+_NOTED_BACKEND = Annotated[
+    str | None, _optional("REF", f"Backend, as {_REF}; what the recording notes if left out.")
+]
+_EPOCHS = Annotated[int | None, _optional("INT", "Training epochs; the policy's own if left out.")]
 _WORKERS = Annotated[int, arg(help="Processes to use.")]
 _SEED = Annotated[int, arg(help="Seed of everything random in this step.")]
 _IMAGE = Annotated[
     str, arg(help="Size of recorded pictures [pixels]: 128, or width and height as in 160x120.")
 ]
+_CAMERAS = Annotated[
+    str, arg(help="Cameras to record and learn from, with commas between, such as wrist,overview.")
+]
 _DEVICE = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Where the policy runs.")]
-_POLICY = Annotated[str, arg(help="Policy: compact_mlp, or resnet18_mlp as in the paper.")]
+_STRATEGY = Annotated[
+    str,
+    arg(
+        metavar="REF",
+        help="sart: straight lines; sart_planned: round obstacles where these are blocked; or "
+        "your own.",
+    ),
+]
+_POLICY = Annotated[
+    str,
+    arg(metavar="REF", help="Policy: compact_mlp, resnet18_mlp as in the paper, or your own."),
+]
 _N = Annotated[int, arg(help="Trajectories in all, the demonstration among them.")]
 _EPISODES = Annotated[int, arg(help="Rollouts with random placements.")]
 _EVAL_SEED = Annotated[int, arg(help="Seed of the placements, apart from training's.")]
@@ -60,21 +93,25 @@ class Run:
 
     Example: sart run peg_in_hole --out runs/peg --n 40 --episodes 100 --workers 2
 
-    An interrupted run goes on where it was when the same command is typed again.
+    Example: sart run drawer.py:Drawer --robot my_panda:PANDA --out runs/drawer
+
+    An interrupted run resumes when the same command is typed again.
     """
 
     task: _TASK
     out: Annotated[Path, arg(help="Directory to write.")]
     backend: _BACKEND = "pybullet"
     robot: _ROBOT = None
+    strategy: _STRATEGY = "sart"
     policy: _POLICY = "compact_mlp"
     n: _N = 40
     episodes: _EPISODES = 50
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000
+    cameras: _CAMERAS = "wrist"
     image_size: _IMAGE = "128"
     distribution: _DISTRIBUTION = "paper"
-    epochs: Annotated[int | None, arg(help="Training epochs; the policy's own if left out.")] = None
+    epochs: _EPOCHS = None
     workers: _WORKERS = 2
     device: _DEVICE = "auto"
     overwrite: _OVERWRITE = False
@@ -96,22 +133,29 @@ class Record:
 
     task: _TASK
     out: Annotated[Path, arg(help="HDF5 file to write.")]
-    device: Annotated[str, arg(help="What steers: keyboard, spacemouse, gamepad, or scripted.")] = (
-        "scripted"
-    )
+    device: Annotated[
+        str, arg(metavar="REF", help="What steers: keyboard, spacemouse, gamepad, or scripted.")
+    ] = "scripted"
     backend: _BACKEND = "pybullet"
     robot: _ROBOT = None
     frame: Annotated[
         Literal["world", "tool"] | None,
-        arg(help="What your directions are fixed to at first: world, or tool. F changes it."),
+        _optional(
+            "{world,tool}",
+            "What your directions are fixed to at first; world if left out. F changes it.",
+        ),
     ] = None
     operator: Annotated[
-        str | None, arg(help="Who steers, kept with the demonstration; 'person' if left out.")
+        str | None,
+        _optional("TEXT", "Who steers, kept with the demonstration; 'person' if left out."),
     ] = None
     max_seconds: Annotated[float, arg(help="Longest demonstration [s].")] = 120.0
     status: Annotated[
         Path | None,
-        arg(help="File for other programs to watch: one JSON line for each recorded step."),
+        _optional(
+            "PATH",
+            "File for others to watch: a JSON line for each recorded step; none if left out.",
+        ),
     ] = None
     seed: _SEED = 0
     placement: Annotated[
@@ -120,7 +164,7 @@ class Record:
     yaw_deg: _YAW = 0.0
     vary_looks: _LOOKS = False
     image_size: _IMAGE = "128"
-    cameras: Annotated[str, arg(help="Cameras to record, with commas between.")] = "wrist"
+    cameras: _CAMERAS = "wrist"
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -139,16 +183,16 @@ class Play:
     file: Annotated[
         Positional[Path], arg(metavar="FILE", help="Demonstration, or an episode in its dataset.")
     ]
-    out: Annotated[Path | None, arg(help="MP4 file to write; shown in a window if left out.")] = (
-        None
-    )
+    out: Annotated[
+        Path | None, _optional("PATH", "MP4 file to write; shown in a window if left out.")
+    ] = None
     camera: Annotated[
         str, arg(help="A camera of the scene, drawn again; or a recorded one, such as wrist.")
     ] = "overview"
     speed: Annotated[float, arg(help="Times real time.")] = 1.0
-    backend: Annotated[
-        str | None, arg(help="What draws the scene; the recording's backend if left out.")
-    ] = None
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
+    backend: _NOTED_BACKEND = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -167,8 +211,15 @@ class Suggest:
     demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
     out: Annotated[Path, arg(help="JSON file to write.")]
     waypoints: Annotated[
-        tuple[int, ...], arg(help="Key waypoints; chosen to tile the free part if left out.")
+        tuple[int, ...],
+        arg(
+            metavar="INT [INT ...]",
+            help="Key waypoints; chosen to tile the free part if left out.",
+            help_behavior_hint="",
+        ),
     ] = ()
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
     margin: _TOOL_MARGIN = 0.0005
@@ -189,13 +240,15 @@ class Annotate:
 
     Example: sart annotate demo.h5 --suggest-all --no-window --out annotation.json
 
-    An annotation that is there is gone on with, also after an interruption.
+    An existing annotation is continued, also after an interruption.
     """
 
     demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
     out: Annotated[
         Path | None,
-        arg(help="JSON file to edit or make; DEMO's name with .annotation.json if left out."),
+        _optional(
+            "PATH", "JSON file to edit or make; DEMO's name with .annotation.json if left out."
+        ),
     ] = None
     text: Annotated[bool, arg(help="Without a window: type words, or pipe them in.")] = False
     suggest_all: Annotated[bool, arg(help="Begin with all spheres suggested.")] = False
@@ -205,13 +258,15 @@ class Annotate:
     show: Annotated[
         Literal["cloud", "scene"], arg(help="What is drawn first: recorded points, or meshes.")
     ] = "cloud"
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
     margin: _TOOL_MARGIN = 0.0005
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
     max_radius: _MAX_RADIUS = 0.15
-    overwrite: Annotated[bool, arg(help="Begin anew instead of going on.")] = False
+    overwrite: Annotated[bool, arg(help="Begin again instead of continuing.")] = False
     json: _JSON = False
 
 
@@ -236,11 +291,10 @@ class Augment:
     ]
     out: Annotated[Path, arg(help="Directory to write.")]
     n: _N = 40
-    backend: Annotated[str | None, arg(help="Backend; the demonstration's if left out.")] = None
-    strategy: Annotated[
-        str,
-        arg(help="sart: straight lines; sart_planned: round obstacles where these are blocked."),
-    ] = "sart"
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
+    backend: _NOTED_BACKEND = None
+    strategy: _STRATEGY = "sart"
     allocation: Annotated[
         Literal["radius", "equal"],
         arg(help="How spheres share the trajectories: by their radii, or equally as in the paper."),
@@ -273,12 +327,14 @@ class Validate:
     dataset: Annotated[
         Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment`.")
     ]
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
     json: _JSON = False
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a policy on a dataset; interrupted training goes on when typed again.
+    """Train a policy on a dataset; interrupted training resumes when typed again.
 
     Example: sart train dataset --out skill
 
@@ -293,26 +349,39 @@ class Train:
     ]
     out: Annotated[Path, arg(help="Skill directory to write.")]
     policy: _POLICY = "compact_mlp"
-    epochs: Annotated[
-        int | None, arg(help="Passes over the data; the policy's own if left out.")
+    epochs: _EPOCHS = None
+    lr: Annotated[
+        float | None, _optional("FLOAT", "Learning rate; the policy's own if left out.")
     ] = None
-    lr: Annotated[float | None, arg(help="Learning rate; the policy's own if left out.")] = None
-    batch_size: Annotated[int | None, arg(help="The policy's own if left out.")] = None
+    batch_size: Annotated[int | None, _optional("INT", "The policy's own if left out.")] = None
     image_size: Annotated[
-        int | None, arg(help="Pictures are scaled to this [pixels]; the policy's own if left out.")
+        int | None,
+        _optional("INT", "Pictures are scaled to this [pixels]; the policy's own if left out."),
     ] = None
     image_shift: Annotated[
-        int | None, arg(help="Random shift of the pictures, up to this [pixels].")
+        int | None,
+        _optional(
+            "INT",
+            "Random shift of the pictures, up to this [pixels]; the policy's own if left out.",
+        ),
     ] = None
-    cameras: Annotated[str, arg(help="Cameras it sees, names with commas between.")] = "wrist"
+    cameras: _CAMERAS = "wrist"
     schedule: Annotated[
-        Literal["cosine", "constant"] | None, arg(help="Course of the learning rate.")
+        Literal["cosine", "constant"] | None,
+        _optional(
+            "{cosine,constant}", "Course of the learning rate; the policy's own if left out."
+        ),
     ] = None
     norm: Annotated[
-        Literal["batch", "group"] | None, arg(help="Normalisation layers of resnet18_mlp.")
+        Literal["batch", "group"] | None,
+        _optional("{batch,group}", "Normalisation layers, of resnet18_mlp; its own if left out."),
     ] = None
     backbone_weights: Annotated[
-        Path | None, arg(help="File with ResNet18 weights (torchvision's names).")
+        Path | None,
+        _optional(
+            "PATH",
+            "File with ResNet18 weights (torchvision's names) to start from; none if left out.",
+        ),
     ] = None
     seed: _SEED = 0
     device: _DEVICE = "auto"
@@ -331,7 +400,9 @@ class Evaluate:
 
     skill: Annotated[Positional[Path], arg(metavar="SKILL", help="Directory from `sart train`.")]
     out: Annotated[Path, arg(help="JSON file to write; videos go beside it.")]
-    backend: Annotated[str | None, arg(help="Backend; the demonstration's if left out.")] = None
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
+    backend: _NOTED_BACKEND = None
     episodes: _EPISODES = 50
     eval_seed: _EVAL_SEED = 1000
     yaw_deg: _YAW = 0.0
@@ -350,7 +421,7 @@ class BenchmarkOperator:
     Example: sart benchmark operator --tasks all --backends pybullet,sapien --episodes 100
         --out operator.json
 
-    Interrupted, it goes on where it was when the same command is typed again.
+    Interrupted, it resumes when the same command is typed again.
     """
 
     tasks: _TASKS = "all"
@@ -393,7 +464,7 @@ class BenchmarkSegments:
     Example: sart benchmark segments --tasks peg_in_hole --backends pybullet --source cloud
         --count 200
 
-    Interrupted, it goes on where it was when the same command is typed again.
+    Interrupted, it resumes when the same command is typed again.
     """
 
     tasks: _TASKS = "all"
@@ -416,7 +487,7 @@ class BenchmarkRadii:
 
     Example: sart benchmark radii --tasks all --draws 2000 --directed 20000 --out radii.json
 
-    Interrupted, it goes on where it was when the same command is typed again.
+    Interrupted, it resumes when the same command is typed again.
     """
 
     tasks: _TASKS = "all"
@@ -455,7 +526,7 @@ class BenchmarkSkill:
     Example: sart benchmark skill --tasks peg_in_hole,toolbox_picking --backends all
         --out runs/skills --episodes 20
 
-    Interrupted, it goes on where it was when the same command is typed again.
+    Interrupted, it resumes when the same command is typed again.
     """
 
     out: Annotated[Path, arg(help="Directory to write.")]
@@ -463,12 +534,29 @@ class BenchmarkSkill:
     backends: _BACKENDS = "all"
     policy: _POLICY = "compact_mlp"
     n: _N = 40
-    epochs: Annotated[int | None, arg(help="Training epochs; the policy's own if left out.")] = None
+    epochs: _EPOCHS = None
     episodes: _EPISODES = 20
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000
     workers: _WORKERS = 2
     device: _DEVICE = "auto"
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write the page about a run: pictures, videos and figures in one HTML file.
+
+    Example: sart report runs/peg
+
+    Example: sart report runs/peg --out peg.html
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN", help="Directory from `sart run`.")]
+    out: Annotated[
+        Path | None, _optional("PATH", "HTML file to write; report.html in RUN if left out.")
+    ] = None
+    overwrite: _OVERWRITE = False
     json: _JSON = False
 
 
@@ -488,36 +576,14 @@ class Info:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say what works on this machine and how to mend what doesn't.
+    """Say what works on this machine and how to fix what doesn't.
 
     Example: sart doctor
+
+    Example: sart doctor --full
     """
 
+    full: Annotated[
+        bool, arg(help="Also try out torch, SAPIEN, windows and devices, which takes longer.")
+    ] = False
     json: _JSON = False
-
-
-Verb = (
-    Annotated[Run, tyro.conf.subcommand("run")]
-    | Annotated[Record, tyro.conf.subcommand("record")]
-    | Annotated[Play, tyro.conf.subcommand("play")]
-    | Annotated[Suggest, tyro.conf.subcommand("suggest")]
-    | Annotated[Annotate, tyro.conf.subcommand("annotate")]
-    | Annotated[Augment, tyro.conf.subcommand("augment")]
-    | Annotated[Validate, tyro.conf.subcommand("validate")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[
-        Annotated[BenchmarkOperator, tyro.conf.subcommand("operator")]
-        | Annotated[BenchmarkReplay, tyro.conf.subcommand("replay")]
-        | Annotated[BenchmarkSegments, tyro.conf.subcommand("segments")]
-        | Annotated[BenchmarkRadii, tyro.conf.subcommand("radii")]
-        | Annotated[BenchmarkCloud, tyro.conf.subcommand("cloud")]
-        | Annotated[BenchmarkSkill, tyro.conf.subcommand("skill")],
-        tyro.conf.subcommand(
-            "benchmark",
-            description="Measure operator, backends, motions or skills over many tasks.",
-        ),
-    ]
-    | Annotated[Info, tyro.conf.subcommand("info")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
-)

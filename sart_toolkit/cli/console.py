@@ -2,28 +2,93 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
+import shlex
 import sys
-from collections.abc import Iterator, Mapping
-from typing import Any
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
-from tqdm import tqdm
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+_UNITS = {
+    "record": "s",
+    "play": "picture",
+    "suggest": "waypoint",
+    "augment": "trajectory",
+    "validate": "episode",
+    "train": "step",
+    "evaluate": "rollout",
+    "operator": "episode",
+    "replay": "replay",
+    "segments": "segment",
+    "radii": "task",
+    "cloud": "task",
+}
+_PLURALS = {"s": "s", "trajectory": "trajectories"}
+# Where nobody watches a bar, a line is written so often [s].
+_LINE_SECONDS = 10.0
 
 
-@contextlib.contextmanager
-def progress_bar(what: str, total: int | None, unit: str) -> Iterator[tqdm[Any]]:
-    """A bar on stderr, left out where stderr isn't a terminal."""
-    bar = tqdm(total=total, desc=f"{what:<9}", unit=unit, file=sys.stderr, disable=None, leave=True)
-    try:
-        yield bar
-    finally:
-        bar.close()
+class ProgressDisplay:
+    """How far each stage is, on stderr: a bar on a terminal, elsewhere a line now and then."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._bar: tqdm[Any] | None = None
+        self._said = time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._close()
+
+    def __call__(
+        self, stage: str, done: float, total: float | None = None, text: str = "", /
+    ) -> None:
+        """Show that a stage has `done` of `total`, and a few words."""
+        if sys.stderr.isatty():
+            self._show_bar(stage, done, total, text)
+        elif time.monotonic() - self._said >= _LINE_SECONDS:
+            self._said = time.monotonic()
+            unit = _PLURALS.get(_UNITS[stage], f"{_UNITS[stage]}s")
+            amount = f"{done:.0f}" if total is None else f"{done:.0f} of {total:.0f}"
+            say(f"{stage}: {amount} {unit}{text and f', {text}'}")
+
+    def _show_bar(self, stage: str, done: float, total: float | None, text: str) -> None:
+        if self._bar is None or stage != self._stage:
+            self._close()
+            from tqdm import tqdm
+
+            self._stage = stage
+            self._bar = tqdm(total=total, desc=f"{stage:<9}", unit=_UNITS[stage], file=sys.stderr)
+        self._bar.total = total
+        if text:
+            self._bar.set_postfix_str(text, refresh=False)
+        self._bar.update(done - self._bar.n)
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
 
 
 def say(text: str) -> None:
     """A line for the person who waits, on stderr."""
     print(text, file=sys.stderr, flush=True)
+
+
+def typed() -> str:
+    """The command as it was typed."""
+    return shlex.join(["sart", *sys.argv[1:]])
 
 
 def show(result: Mapping[str, Any], as_json: bool) -> None:

@@ -11,9 +11,9 @@ from sart_toolkit.cli.arguments import Doctor
 from sart_toolkit.cli.console import show
 
 
-def run_doctor(args: Doctor) -> None:
-    """Print the findings, and exit with 1 where something required does not work."""
-    findings = doctor.diagnose()
+def doctor_verb(args: Doctor) -> dict[str, Any]:
+    """`sart doctor`; exits with 1 where something required does not work."""
+    findings = doctor.diagnose(args.full)
     usable = all(finding.ok for finding in findings if finding.required)
     result: dict[str, Any] = {"usable": usable}
     if args.json:
@@ -21,8 +21,12 @@ def run_doctor(args: Doctor) -> None:
     else:
         for finding in findings:
             mark = "ok  " if finding.ok else ("FAIL" if finding.required else "off ")
+            mark = mark if finding.tried else "?   "
             remedy = f"\n      -> {finding.remedy}" if finding.remedy and not finding.ok else ""
             result[f"{mark} {finding.name}"] = f"{finding.detail}{remedy}"
-    show(result, args.json)
+        if not args.full:
+            result["?"] = "is installed; `sart doctor --full` tries it out"
     if not usable:
+        show(result, args.json)
         sys.exit(1)
+    return result

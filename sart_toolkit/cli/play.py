@@ -1,19 +1,38 @@
-"""Looking at recordings, for `sart play`: which one a path names, and window or film."""
+"""`sart play`: which recording a path names, and window or film."""
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Play
-from sart_toolkit.cli.console import progress_bar
+from sart_toolkit.cli.console import ProgressDisplay
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import check_writable, load_demonstration, load_recording
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile
 from sart_toolkit.poses import check_positive
-from sart_toolkit.record.screen import Screen
-from sart_toolkit.report.player import Playback, PlayWindow, SceneView, film
-from sart_toolkit.report.video import write_video
+
+if TYPE_CHECKING:
+    from sart_toolkit.report.player import Playback, SceneView
+
+
+def play_verb(args: Play) -> dict[str, Any]:
+    """`sart play`."""
+    pipeline.check_names(task=args.task, robot=args.robot, backend=args.backend)
+    check_play_options(args)
+    playback = load_playback(args.file)
+    shown = playback.demonstration
+    if args.camera in shown.steps.cameras:
+        playback.camera = args.camera
+        return play(args, playback, None)
+    from sart_toolkit.report.player import SceneView
+
+    size = pipeline.image_size_of(shown)
+    make = pipeline.backend_maker(shown, size, shown.rates, args.task, args.robot, args.backend)
+    with closing(make()) as backend:
+        return play(args, playback, SceneView(playback, backend, args.camera))
 
 
 def load_playback(path: Path) -> Playback:
@@ -29,6 +48,8 @@ def load_playback(path: Path) -> Playback:
     if path.suffix == ".json":
         raise BrokenFile(f"{path}: holds no recording; pass a demonstration's or an episode's .h5")
     recording = load_recording(path)
+    from sart_toolkit.report.player import Playback
+
     if isinstance(recording, Demonstration):
         return Playback(path.name, recording)
     at = path.resolve().parent
@@ -77,15 +98,21 @@ def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, A
         "seconds": playback.seconds,
     }
     if args.out is None:
+        from sart_toolkit.record.screen import Screen
+        from sart_toolkit.report.player import PlayWindow
+
         with Screen(f"sart play {playback.title}") as screen:
             PlayWindow(playback, scene, screen, args.speed).run()
         return said
-    with progress_bar("play", len(playback), "picture") as bar:
+    from sart_toolkit.report.player import film
+    from sart_toolkit.report.video import write_video
+
+    with ProgressDisplay() as progress:
 
         def counted() -> Any:
-            for frame in film(playback, scene):
+            for i, frame in enumerate(film(playback, scene), 1):
                 yield frame
-                bar.update(1)
+                progress("play", i, len(playback))
 
         write_video(args.out, counted(), playback.hz * args.speed)
     return said | {"film": str(args.out)}

@@ -2,36 +2,41 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from sart_toolkit.backends.interface import Backend
 from sart_toolkit.cli.arguments import Record
 from sart_toolkit.cli.console import say
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import append_json_line, check_writable, remove, save_demonstration
-from sart_toolkit.errors import Discarded, InvalidInput, NoDisplay
+from sart_toolkit.errors import Discarded, NoDisplay
 from sart_toolkit.motion.controller import ControllerConfig
 from sart_toolkit.record.desk import RecordingDesk
 from sart_toolkit.record.devices.manual import ManualDevice
 from sart_toolkit.record.screen import Screen, start_sdl
-from sart_toolkit.record.session import SessionConfig, TeleopSession
+from sart_toolkit.record.session import DeviceSetup, SessionConfig, TeleopSession
 from sart_toolkit.record.window import RecordingWindow
-from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.tasks.task import Placement
 
 
 def record_by_hand(
     args: Record,
-    backend: Backend,
-    task: Task,
-    model: RobotModel,
+    setup: DeviceSetup,
     device: ManualDevice,
     placement: Placement,
+    config: SessionConfig,
 ) -> Demonstration:
     """The demonstration that a person steered and saved at `args.out`.
+
+    Args:
+        args: what was typed.
+        setup: what the device was made for.
+        device: what is held.
+        placement: where the object stands.
+        config: how it is recorded; how it ends and how joints are limited is decided here.
 
     Raises:
         Discarded: the person threw it away.
@@ -42,6 +47,8 @@ def record_by_hand(
         MissingExtra: a library isn't installed.
     """
 
+    backend, task = setup.backend, setup.task
+
     def save(demonstration: Demonstration) -> None:
         check_writable(args.out, args.overwrite)
         save_demonstration(args.out, demonstration)
@@ -50,8 +57,7 @@ def record_by_hand(
         if args.status is not None:
             append_json_line(args.status, status)
 
-    cameras = tuple(args.cameras.split(","))
-    backend.check_cameras(cameras)
+    backend.check_cameras(config.cameras)
     if args.status is not None:
         check_writable(args.status, args.overwrite)
         remove(args.status)
@@ -62,13 +68,12 @@ def record_by_hand(
         robot = backend.robot
         # No joint goes faster than it can, so nothing jumps near the edge of what can be reached.
         slowest = float(np.min(robot.velocity_limits)) / backend.rates.control_hz
-        config = SessionConfig(
-            cameras=cameras,
-            max_seconds=args.max_seconds,
+        config = dataclasses.replace(
+            config,
             end_on_success=True,
             controller=ControllerConfig(max_joint_step=slowest),
         )
-        session = TeleopSession(backend, task, model, placement, config)
+        session = TeleopSession(backend, task, setup.model, placement, config)
         desk = RecordingDesk(session, device, save, watch)
         with Screen(f"sart record {task.name}") as screen:
             RecordingWindow(desk, screen, str(args.out)).run()
@@ -83,18 +88,3 @@ def record_by_hand(
     if desk.demonstration is None:
         raise Discarded("the recording was discarded, nothing was written; record again")
     return desk.demonstration
-
-
-def check_hand_options(args: Record, interactive: bool) -> None:
-    """Refuse options that mean nothing to a script.
-
-    Raises:
-        InvalidInput: one was given.
-    """
-    if interactive:
-        return
-    for name in ("frame", "operator", "status"):
-        if getattr(args, name) is not None:
-            raise InvalidInput(
-                f"--{name}: is for a device that a person holds; add --device keyboard, say"
-            )

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.model import robot_parts
-from sart_toolkit.data.records import CameraRecord, Demonstration, Image
+from sart_toolkit.data.records import CameraRecord, Demonstration, Image, summary
 from sart_toolkit.errors import InvalidInput, Mismatch, unknown_name
 from sart_toolkit.poses import (
     Array,
@@ -116,6 +116,9 @@ class SceneCloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        return summary(self, points=len(self), behind=int(self.behind.sum()))
 
     def without(self, p_world: ArrayLike, margin: float | None = None) -> SceneCloud:
         """The cloud less what lies in the convex hull of some points: an object taken away, say.

@@ -135,6 +135,12 @@ def digest(parts: Mapping[str, Any]) -> str:
     return sha.hexdigest()
 
 
+def summary(record: object, **figures: object) -> str:
+    """A record's repr in a line: its class and the figures that matter, without any array."""
+    inside = ", ".join(f"{name}={value}" for name, value in figures.items())
+    return f"{type(record).__name__}({inside})"
+
+
 @dataclass(frozen=True)
 class CameraRecord:
     """What one camera saw: `rgb (T,H,W,3)` uint8, `depth (T,H,W)` float32 metres (0: nothing hit).
@@ -172,6 +178,10 @@ class CameraRecord:
         if self.frame == "tool":
             return Ts_world_tool @ self.T_frame_camera
         return np.broadcast_to(self.T_frame_camera, np.shape(Ts_world_tool))
+
+    def __repr__(self) -> str:
+        n, height, width, _ = self.rgb.shape
+        return summary(self, pictures=n, width=width, height=height)
 
 
 @dataclass(frozen=True)
@@ -220,6 +230,10 @@ class Steps:
     def __len__(self) -> int:
         return len(self.measured_gripper)
 
+    def __repr__(self) -> str:
+        joints = self.joint_positions.shape[1]
+        return summary(self, steps=len(self), joints=joints, cameras=list(self.cameras))
+
     def content(self) -> dict[str, Any]:
         """The arrays by name, for hashing."""
         parts: dict[str, Any] = {
@@ -231,8 +245,26 @@ class Steps:
         return parts
 
 
+class Referring:
+    """What was made with a robot, on a task and a backend, and says how to find these again.
+
+    `robot`, `task`, `backend` are their names; `references` may hold for each of these words what
+    `registry.resolve` finds it by.
+    """
+
+    robot: str
+    task: str
+    backend: str
+    references: Mapping[str, str]
+
+    def reference(self, kind: Literal["robot", "task", "backend"]) -> str:
+        """What finds the robot, task or backend: its noted reference, or else its name."""
+        name: str = getattr(self, kind)
+        return self.references.get(kind, name)
+
+
 @dataclass(frozen=True)
-class Demonstration:
+class Demonstration(Referring):
     """One demonstration: its steps, the bodies, and what it takes to start from any step.
 
     `rates`: how often it was commanded and recorded; `timestamps (T,)` [s]; `body_Ts_world` maps
@@ -262,6 +294,7 @@ class Demonstration:
     versions: Mapping[str, str] = field(default_factory=dict)
     rates: Rates = DEFAULT_RATES
     judged_by: Judge = "task"
+    references: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.judged_by not in get_args(Judge):
@@ -297,6 +330,17 @@ class Demonstration:
 
     def __len__(self) -> int:
         return len(self.steps)
+
+    def __repr__(self) -> str:
+        return summary(
+            self,
+            task=self.task,
+            robot=self.robot,
+            backend=self.backend,
+            operator=self.operator,
+            waypoints=len(self),
+            cameras=list(self.steps.cameras),
+        )
 
     @property
     def actions(self) -> Array:
@@ -424,6 +468,10 @@ class Annotation:
                     "tool pose there; keep it, and move the sphere by changing its waypoint"
                 )
 
+    def __repr__(self) -> str:
+        radii = [f"{sphere.radius * 1e3:.1f} mm" for sphere in self.spheres]
+        return summary(self, waypoints=[s.waypoint for s in self.spheres], radii=radii)
+
 
 def convergence_waypoint(demonstration: Demonstration, sphere: PrecisionSphere) -> int:
     """t*: the first waypoint after the key waypoint that lies outside its sphere (paper, Eq. t*).
@@ -481,6 +529,10 @@ class Episode:
 
     def __len__(self) -> int:
         return len(self.steps)
+
+    def __repr__(self) -> str:
+        at = self.provenance
+        return summary(self, steps=len(self), sphere=at.sphere, k=at.k, t_star=at.t_star)
 
     def commands(self, demonstration: Demonstration) -> tuple[Array, Array]:
         """Commanded tool poses `(n, 4, 4)` and gripper `(n,)` of the whole joined trajectory."""

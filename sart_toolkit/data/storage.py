@@ -437,6 +437,7 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
                 "versions": dict(d.versions),
                 "rates": dataclasses.asdict(d.rates),
                 "judged_by": d.judged_by,
+                "references": dict(d.references),
                 "content_hash": d.content_hash(),
             }
         )

@@ -19,6 +19,7 @@ from sart_toolkit.data.records import (
     Annotation,
     Demonstration,
     Image,
+    Referring,
     library_versions,
 )
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, SartError
@@ -46,7 +47,7 @@ class SkillCamera:
     """A camera as it was in the demonstration.
 
     `size` is the recorded `(height, width)` [pixels]; `intrinsics (3, 3)` in pixels;
-    `T_tool_camera (4, 4)`.
+    `T_frame_camera (4, 4)` in the `frame` that it was mounted on, "tool" or "world".
     """
 
     size: tuple[int, int]
@@ -75,7 +76,7 @@ class SkillCamera:
 
 
 @dataclass(frozen=True)
-class SkillConfig:
+class SkillConfig(Referring):
     """What must be known to execute a skill elsewhere.
 
     The task and its parameters, robot and backend it was shown on; the `cameras` it sees by name;
@@ -89,6 +90,7 @@ class SkillConfig:
     cameras: Mapping[str, SkillCamera]
     demonstration_hash: str
     training: TrainConfig
+    references: Mapping[str, str]
 
     def __post_init__(self) -> None:
         if set(self.cameras) != set(self.training.cameras):
@@ -113,6 +115,7 @@ class SkillConfig:
             "task_parameters": dict(self.task_parameters),
             "cameras": {name: camera.to_json() for name, camera in self.cameras.items()},
             "training": self.training.to_json(),
+            "references": dict(self.references),
         }
 
     @classmethod
@@ -300,6 +303,7 @@ def save_skill(
         },
         demonstration_hash=demonstration.content_hash(),
         training=result.config,
+        references=demonstration.references,
     )
     storage.save_demonstration(path / "demo.h5", demonstration)
     storage.save_annotation(path / "annotation.json", source.annotation)

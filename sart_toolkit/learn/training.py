@@ -22,11 +22,12 @@ from torch import Tensor
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
-from sart_toolkit.learn.policies import get_policy
+from sart_toolkit.learn.policies import POLICIES, get_policy
 from sart_toolkit.learn.policy import Policy, PolicySetup
 from sart_toolkit.learn.samples import WindowConfig, Windows, open_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.poses import check_positive
+from sart_toolkit.registry import lasting_reference
 
 CHECKPOINT = "checkpoint.safetensors"
 _CHECKPOINT_SECONDS = 30.0
@@ -46,10 +47,11 @@ class TrainConfig:
     shifted by up to `image_shift` pixels at random. `hidden`: width of the head. `norm`: the
     policy's normalisation layers. `backbone_weights`: a file of weights to start from. `bfloat16`:
     "auto", "on" or "off". `device`: "auto", "cpu" or "cuda". `threads`: torch's threads, its own
-    choice if None. `seed` decides the initial weights, the order and the shifts.
+    choice if None. `seed` decides the initial weights, the order and the shifts. `policy` may be
+    given as a class; its reference is kept.
     """
 
-    policy: str
+    policy: str | type[Policy]
     epochs: int
     batch_size: int
     lr: float
@@ -69,6 +71,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         norms = get_policy(self.policy).norms
+        object.__setattr__(self, "policy", lasting_reference("policy", self.policy, POLICIES))
         cameras = tuple(self.cameras)
         if not cameras or len(set(cameras)) < len(cameras):
             raise InvalidInput(f"cameras: expected different names, at least one, got {cameras}")
@@ -106,7 +109,7 @@ class TrainConfig:
                 )
 
     @classmethod
-    def for_policy(cls, policy: str, **overrides: Any) -> TrainConfig:
+    def for_policy(cls, policy: str | type[Policy], **overrides: Any) -> TrainConfig:
         """The options that suit a policy, some of them replaced.
 
         Raises:

@@ -12,7 +12,7 @@ from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import check_positive, relative_motion
 from sart_toolkit.record.session import Device, DeviceSetup, TeleopCommand
-from sart_toolkit.tasks.task import Stage
+from sart_toolkit.tasks.task import PlanStep
 
 
 @dataclass(frozen=True)
@@ -53,23 +53,23 @@ class ScriptedOperator(Device):
 
     def __init__(
         self,
-        stages: Sequence[Stage],
+        plan: Sequence[PlanStep],
         rng: np.random.Generator,
         style: OperatorStyle | None = None,
         control_hz: int = DEFAULT_RATES.control_hz,
     ) -> None:
-        """Follow `stages` in order, with the hand's noise drawn from `rng`.
+        """Follow the steps of `plan` in order, with the hand's noise drawn from `rng`.
 
         Raises:
-            InvalidInput: there is no stage.
+            InvalidInput: the plan is empty.
         """
-        if not stages:
-            raise InvalidInput("operator: the plan has no stage; give it at least one")
-        self._stages = list(stages)
+        if not plan:
+            raise InvalidInput("operator: the plan has no step; give it at least one")
+        self._plan = list(plan)
         self._rng = rng
         self._style = style or OperatorStyle()
         self._dt = 1.0 / control_hz
-        self._leg = 0
+        self._at = 0
         self._paused = 0.0
         self._still = 0.0
         self._hesitating = 0.0
@@ -78,16 +78,16 @@ class ScriptedOperator(Device):
 
     def read(self, observation: Observation) -> TeleopCommand:
         style, dt = self._style, self._dt
-        stage = self._stages[self._leg]
-        error = relative_motion(observation.T_world_tool, stage.T_world_tool)
+        step = self._plan[self._at]
+        error = relative_motion(observation.T_world_tool, step.T_world_tool)
         far, turn = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
-        if far < stage.tolerance and turn < np.deg2rad(stage.tolerance_deg):
+        if far < step.tolerance and turn < np.deg2rad(step.tolerance_deg):
             self._paused += dt
-            if self._paused > stage.pause:
-                if self._leg + 1 < len(self._stages):
-                    self._leg += 1
+            if self._paused > step.pause:
+                if self._at + 1 < len(self._plan):
+                    self._at += 1
                     self._paused = 0.0
-                    if not stage.through:
+                    if not step.through:
                         self._hesitating = float(self._rng.uniform(0.0, style.hesitation))
                     return self.read(observation)
                 self._still += dt
@@ -96,8 +96,8 @@ class ScriptedOperator(Device):
         resting = self._still > 0
         wanted = np.zeros(6)
         if not resting:
-            near = stage.speed if stage.through else max(style.approach * far, style.creep)
-            speed = min(stage.speed, near)
+            near = step.speed if step.through else max(style.approach * far, style.creep)
+            speed = min(step.speed, near)
             if self._hesitating > 0:
                 self._hesitating -= dt
                 speed = min(speed, style.creep)
@@ -112,7 +112,7 @@ class ScriptedOperator(Device):
         noise = self._rng.standard_normal(6) * np.sqrt(1.0 - keep**2)
         self._tremor = keep * self._tremor + noise * spread * (0.0 if resting else 1.0)
         stop = self._still > style.rest
-        return TeleopCommand(self._velocity + self._tremor, stage.gripper, stop)
+        return TeleopCommand(self._velocity + self._tremor, step.gripper, stop)
 
 
 def scripted_operator(setup: DeviceSetup) -> ScriptedOperator:

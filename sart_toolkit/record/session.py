@@ -10,12 +10,13 @@ import abc
 import enum
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from sart_toolkit.backends import BACKENDS
 from sart_toolkit.backends.interface import (
     Backend,
     Contact,
@@ -31,9 +32,12 @@ from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.motion.controller import ControllerConfig, ToolController
 from sart_toolkit.poses import Array, apply_motion, check_array, check_positive, frozen
 from sart_toolkit.record.recorder import StepRecorder
+from sart_toolkit.registry import reference_to
+from sart_toolkit.robots import ROBOTS
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import check_gripper
 from sart_toolkit.scenes.spec import SceneState
+from sart_toolkit.tasks import TASKS
 from sart_toolkit.tasks.task import Placement, Task
 
 Frame = Literal["world", "tool"]
@@ -102,6 +106,8 @@ class SessionConfig:
 
     Without `keep_states` no generated trajectory can start from it, and recording is faster.
     `end_on_success`: it ends by itself once the goal has been reached for the task's `hold`.
+    `references`: what names "robot", "task" or "backend" in the demonstration, where that isn't to
+    be found out.
     """
 
     cameras: tuple[str, ...] = ("wrist",)
@@ -109,6 +115,7 @@ class SessionConfig:
     keep_states: bool = True
     end_on_success: bool = False
     controller: ControllerConfig = field(default_factory=ControllerConfig)
+    references: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_positive("max_seconds", self.max_seconds, "s")
@@ -455,6 +462,12 @@ class TeleopSession:
         self._expect("demonstration", SessionState.ENDED, SessionState.SAVED)
         steps = self._recorder.steps()
         rows = self._recorder.observations
+        references = {
+            "robot": reference_to("robot", self.model.spec, ROBOTS),
+            "task": reference_to("task", self.task, TASKS),
+            "backend": reference_to("backend", type(self.backend), BACKENDS),
+            **self.config.references,
+        }
         return Demonstration(
             task=self.task.name,
             task_parameters={"placement": self.placement.to_json()},
@@ -477,6 +490,7 @@ class TeleopSession:
             versions=library_versions(),
             rates=self.backend.rates,
             judged_by=self.judged_by,
+            references={k: v for k, v in references.items() if v is not None},
         )
 
 

@@ -1,12 +1,17 @@
 """Robots as data (`RobotSpec`) and their kinematics (`RobotModel`).
 
-A new robot is one file with a `SPEC` and one line in `ROBOTS`.
+A new robot is one file with a `SPEC` and one line in `ROBOTS`; one outside the repository needs no
+line, `package.module:NAME` or `path/to/file.py:NAME` names it.
 """
 
 from __future__ import annotations
 
-from sart_toolkit.registry import lookup
-from sart_toolkit.robots.spec import RobotSpec
+from typing import TYPE_CHECKING
+
+from sart_toolkit.registry import expect, resolve
+
+if TYPE_CHECKING:
+    from sart_toolkit.robots.spec import RobotSpec
 
 ROBOTS = {
     "ur5e_2f85": "sart_toolkit.robots.ur5e_2f85:SPEC",
@@ -14,12 +19,13 @@ ROBOTS = {
 }
 
 
-def get_robot(name: str) -> RobotSpec:
-    """The robot called `name`.
+def get_robot(robot: str | RobotSpec) -> RobotSpec:
+    """The robot that a name or reference names; a robot itself is returned.
 
     Raises:
-        UnknownName: no such robot; the message offers the nearest.
+        UnknownName: there is none; the message says which part is wrong.
     """
-    spec = lookup("robot", name, ROBOTS)
-    assert isinstance(spec, RobotSpec)
-    return spec
+    # Here and in the other tables' modules: looking a name up should cost no import.
+    from sart_toolkit.robots.spec import RobotSpec
+
+    return expect("robot", robot, resolve("robot", robot, ROBOTS), RobotSpec)

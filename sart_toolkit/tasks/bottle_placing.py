@@ -10,7 +10,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
 from sart_toolkit.scenes.spec import Body, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
-from sart_toolkit.tasks.task import Placement, Stage, Task
+from sart_toolkit.tasks.task import Placement, PlanStep, Task
 
 BOTTLE_DIAMETER, BODY_LENGTH = 0.065, 0.115
 NECK_DIAMETER, NECK_LENGTH = 0.03, 0.05
@@ -116,15 +116,15 @@ class BottlePlacing(Task):
             return f"bottle over the cup's floor, but {above:.0f} mm above it"
         return f"bottle in the cup, but the jaws only {opening * 1e3:.0f} mm apart"
 
-    def plan(self, state: SceneState) -> list[Stage]:
+    def plan(self, state: SceneState) -> list[PlanStep]:
         p_floor = state.Ts_world_body["cup"][:3, 3] + [0, 0, FLOOR]
 
         def leg(
             height: float, gripper: float, speed: float, tolerance: float, pause: float = 0.0
-        ) -> Stage:
+        ) -> PlanStep:
             """The bottle's bottom, while it is held, `height` above the cup's floor."""
             T = tool_down(p_floor + [0, 0, height + GRIP_HEIGHT])
-            return Stage(T, gripper, speed, tolerance, pause=pause)
+            return PlanStep(T, gripper, speed, tolerance, pause=pause)
 
         return [
             leg(CUP_DEPTH + 0.03, _SQUEEZE, 0.08, 0.006),

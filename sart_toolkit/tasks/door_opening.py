@@ -12,7 +12,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape, look_at
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
-from sart_toolkit.tasks.task import Placement, Stage, Task
+from sart_toolkit.tasks.task import Placement, PlanStep, Task
 
 PANEL_THICKNESS, PANEL_WIDTH, PANEL_HEIGHT = 0.01, 0.29, 0.18
 BAR_RADIUS, BAR_LENGTH, BAR_HEIGHT = 0.0075, 0.06, 0.17
@@ -133,7 +133,7 @@ class DoorOpening(Task):
     def failure_reason(self, observation: Observation) -> str:
         return f"door open by {self._opened_deg(observation):.0f} of {OPEN_DEG:.0f} deg"
 
-    def plan(self, state: SceneState) -> list[Stage]:
+    def plan(self, state: SceneState) -> list[PlanStep]:
         T_world_cabinet = state.Ts_world_body["cabinet"]
 
         def behind_bar(distance: float, depth: float, opened_deg: float = 0.0) -> Array:
@@ -149,12 +149,12 @@ class DoorOpening(Task):
 
         in_gap, at_bar = BAR_RADIUS + BAR_GAP / 2, BAR_RADIUS + _FINGER_HALF
         pull = [
-            Stage(behind_bar(at_bar, _DEPTH, deg), _GRIPPER, 0.05, 0.012, 6.0, through=True)
+            PlanStep(behind_bar(at_bar, _DEPTH, deg), _GRIPPER, 0.05, 0.012, 6.0, through=True)
             for deg in _PULL_DEG
         ]
         return [
-            Stage(behind_bar(in_gap, -0.04), _GRIPPER, 0.08, 0.005),
-            Stage(behind_bar(in_gap, _DEPTH), _GRIPPER, 0.04, 0.005),
+            PlanStep(behind_bar(in_gap, -0.04), _GRIPPER, 0.08, 0.005),
+            PlanStep(behind_bar(in_gap, _DEPTH), _GRIPPER, 0.04, 0.005),
             *pull[:-1],
             dataclasses.replace(pull[-1], through=False),
         ]

@@ -10,7 +10,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
 from sart_toolkit.scenes.spec import Body, Detent, Joint, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
-from sart_toolkit.tasks.task import Placement, Stage, Task
+from sart_toolkit.tasks.task import Placement, PlanStep, Task
 
 DEPTH, WIDTH, HEIGHT = 0.07, 0.09, 0.05
 LID_THICKNESS = 0.006
@@ -111,17 +111,17 @@ class LidClosing(Task):
             return f"lid {angle_deg:.0f} deg open"
         return f"lid shut, but the jaws only {above * 1e3:.0f} mm above it"
 
-    def plan(self, state: SceneState) -> list[Stage]:
+    def plan(self, state: SceneState) -> list[PlanStep]:
         T_world_container = state.Ts_world_body["container"]
         R_world_tool = T_world_container[:3, :3] @ tool_down([0, 0, 0])[:3, :3]
 
-        def leg(height: float, speed: float, tolerance: float, pause: float = 0.0) -> Stage:
+        def leg(height: float, speed: float, tolerance: float, pause: float = 0.0) -> PlanStep:
             """The tips `height` above the lid when shut."""
             T = np.eye(4)
             T[:3, :3] = R_world_tool
             p = [PRESS - DEPTH / 2, 0, LID_TOP + height + TIP, 1]
             T[:3, 3] = (T_world_container @ p)[:3]
-            return Stage(T, _CLOSED, speed, tolerance, pause=pause)
+            return PlanStep(T, _CLOSED, speed, tolerance, pause=pause)
 
         return [
             leg(0.085, 0.08, 0.006),

@@ -12,7 +12,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape, look_at
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
-from sart_toolkit.tasks.task import Placement, Stage, Task
+from sart_toolkit.tasks.task import Placement, PlanStep, Task
 
 LID_DEPTH, LID_WIDTH, LID_THICKNESS = 0.20, 0.32, 0.01
 NOTCH_DEPTH, NOTCH_WIDTH = 0.04, 0.10
@@ -147,7 +147,7 @@ class LidOpening(Task):
     def failure_reason(self, observation: Observation) -> str:
         return f"lid open by {self._opened_deg(observation):.0f} of {OPEN_DEG:.0f} deg"
 
-    def plan(self, state: SceneState) -> list[Stage]:
+    def plan(self, state: SceneState) -> list[PlanStep]:
         T_world_box = state.Ts_world_body["box"]
         yaw = float(np.arctan2(T_world_box[1, 0], T_world_box[0, 0]))
         pitch = np.deg2rad(_PITCH_DEG)
@@ -170,8 +170,11 @@ class LidOpening(Task):
             return _tool(p_world_tip, _PITCH_DEG, yaw)
 
         return [
-            Stage(under_lid(0.0, 0.012, 0.07), _GRIPPER, 0.08, 0.005),
-            Stage(under_lid(0.0, 0.012), _GRIPPER, 0.04, 0.005),
-            *(Stage(under_lid(deg), _GRIPPER, 0.06, 0.008, 6.0, through=True) for deg in _LIFT_DEG),
-            Stage(under_lid(_PUSH_DEG), _GRIPPER, 0.06, 0.006, 6.0, pause=0.5),
+            PlanStep(under_lid(0.0, 0.012, 0.07), _GRIPPER, 0.08, 0.005),
+            PlanStep(under_lid(0.0, 0.012), _GRIPPER, 0.04, 0.005),
+            *(
+                PlanStep(under_lid(deg), _GRIPPER, 0.06, 0.008, 6.0, through=True)
+                for deg in _LIFT_DEG
+            ),
+            PlanStep(under_lid(_PUSH_DEG), _GRIPPER, 0.06, 0.006, 6.0, pause=0.5),
         ]

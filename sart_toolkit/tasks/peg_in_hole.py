@@ -10,7 +10,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, Shape
 from sart_toolkit.scenes.spec import Body, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
-from sart_toolkit.tasks.task import Placement, Stage, Task
+from sart_toolkit.tasks.task import Placement, PlanStep, Task
 
 PEG_WIDTH, PEG_LENGTH = 0.03, 0.08
 HOLE_WIDTH, HOLE_DEPTH = 0.05, 0.04
@@ -115,7 +115,7 @@ class PegInHole(Task):
             return f"peg over the hole, tip {tip[2] * 1e3:.0f} mm above the rim"
         return f"peg in the hole but only {-tip[2] * 1e3:.0f} mm deep"
 
-    def plan(self, state: SceneState) -> list[Stage]:
+    def plan(self, state: SceneState) -> list[PlanStep]:
         hole = state.Ts_world_body["block"]
         T = self._start()
         T[:3, :3] = hole[:3, :3] @ T[:3, :3]
@@ -123,5 +123,5 @@ class PegInHole(Task):
         for tip_height, speed, tolerance in ((0.012, 0.07, 0.004), (-_INSERTION, 0.03, 0.003)):
             T_leg = T.copy()
             T_leg[:3, 3] = hole[:3, 3] + [0, 0, HOLE_DEPTH + tip_height + _PEG_TIP_BELOW_TOOL]
-            legs.append(Stage(T_leg, _GRIPPER, speed, tolerance))
+            legs.append(PlanStep(T_leg, _GRIPPER, speed, tolerance))
         return legs

@@ -15,6 +15,7 @@ from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
 
 
@@ -55,10 +56,10 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One leg of an operator's plan: steer the tool to `T_world_tool (4,4)`, then go on.
+class PlanStep:
+    """One step of an operator's plan: steer the tool to `T_world_tool (4,4)`.
 
-    The leg ends when the tool has been within `tolerance` [m] and `tolerance_deg` for `pause` [s]
+    It ends when the tool has been within `tolerance` [m] and `tolerance_deg` for `pause` [s]
     (while fingers close, for instance). `speed` [m/s] is what a person would choose there;
     `gripper` is the command held throughout. With `through` the operator neither slows down before
     the end nor hesitates after it: a point on a curve.
@@ -77,8 +78,8 @@ class Task(abc.ABC):
     """A skill to be learned, told without naming a simulator.
 
     Attributes:
-        name: as in `TASKS`.
-        robot: the robot it is made for.
+        name: what it is called in files and reports.
+        robot: the robot it is made for: a name, a reference or the robot itself.
         scene: bodies, held bodies and fixed cameras.
         placement_range: half width [m] of the square that the object is placed in.
         yaw_range_deg: the largest turn [deg] either way that its operator can cope with.
@@ -89,7 +90,7 @@ class Task(abc.ABC):
     """
 
     name: str
-    robot: str
+    robot: str | RobotSpec
     scene: SceneSpec
     placement_range: float
     yaw_range_deg: float = 15.0
@@ -111,8 +112,8 @@ class Task(abc.ABC):
         """Why the goal isn't reached now, in a few words with numbers."""
 
     @abc.abstractmethod
-    def plan(self, state: SceneState) -> list[Stage]:
-        """The legs by which a person would steer the tool from the start to the goal."""
+    def plan(self, state: SceneState) -> list[PlanStep]:
+        """The steps by which a person would steer the tool from the start to the goal."""
 
     def achieved(
         self, success: NDArray[np.bool_], record_hz: int = DEFAULT_RATES.record_hz

@@ -10,7 +10,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
 from sart_toolkit.scenes.spec import Body, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
-from sart_toolkit.tasks.task import Placement, Stage, Task
+from sart_toolkit.tasks.task import Placement, PlanStep, Task
 
 BOX_WIDTH, BOX_HEIGHT = 0.12, 0.08
 BAR_WIDTH, BAR_LENGTH = 0.016, 0.08
@@ -86,18 +86,18 @@ class ToolboxPicking(Task):
             return f"handle {np.linalg.norm(p_tool_bar) * 1e3:.0f} mm from between the fingers"
         return f"toolbox between the fingers but only {height * 1e3:.0f} mm above the table"
 
-    def plan(self, state: SceneState) -> list[Stage]:
+    def plan(self, state: SceneState) -> list[PlanStep]:
         toolbox = state.Ts_world_body["toolbox"]
         T = tool_down([0, 0, 0])
         T[:3, :3] = toolbox[:3, :3] @ T[:3, :3]
 
         def leg(
             height: float, gripper: float, speed: float, tolerance: float, pause: float = 0.0
-        ) -> Stage:
+        ) -> PlanStep:
             """The tool's origin `height` above where the bar's middle is now."""
             T_leg = T.copy()
             T_leg[:3, 3] = toolbox[:3, 3] + [0, 0, BAR_HEIGHT + height]
-            return Stage(T_leg, gripper, speed, tolerance, pause=pause)
+            return PlanStep(T_leg, gripper, speed, tolerance, pause=pause)
 
         return [
             leg(0.06, 0.0, 0.08, 0.006),

@@ -14,7 +14,7 @@ from typing import Any
 import coal
 import numpy as np
 
-from sart_toolkit.backends import BACKENDS
+from sart_toolkit.backends import get_backend
 from sart_toolkit.backends.interface import (
     Backend,
     Contact,
@@ -28,12 +28,11 @@ from sart_toolkit.backends.interface import (
     require,
 )
 from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
-from sart_toolkit.errors import InvalidInput, MissingCapability, MissingExtra
+from sart_toolkit.errors import MissingCapability, MissingExtra
 from sart_toolkit.poses import Array, interpolate, inverse, pose
-from sart_toolkit.registry import lookup
-from sart_toolkit.robots import ROBOTS
+from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import ImageSize, RobotSpec
+from sart_toolkit.robots.spec import ImageSize
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
 from sart_toolkit.testing.scenes import BLOCK_TOP, SCENES, STICK_TIP, ready_joints, site
 
@@ -51,41 +50,6 @@ _WORKS = "test_an_ability_that_a_backend_has_works"
 
 # A convex part of a finger: its link, shape, pose in the link, and which side of the tool it is on.
 _Part = tuple[str, coal.CollisionGeometry, Array, int]
-
-
-def find_backend(name: str) -> type[Backend]:
-    """The class that a name of `BACKENDS` or `module:Class` names.
-
-    Raises:
-        InvalidInput: it isn't a `Backend`, or there is no such module or attribute.
-        UnknownName: no such name in the table.
-    """
-    found = _find("backend", name, BACKENDS)
-    if not (isinstance(found, type) and issubclass(found, Backend)):
-        raise InvalidInput(f"backend {name!r}: expected a subclass of Backend, got {found!r}")
-    return found
-
-
-def find_robot(name: str) -> RobotSpec:
-    """The robot that a name of `ROBOTS` or `module:SPEC` names.
-
-    Raises:
-        InvalidInput: it isn't a `RobotSpec`, or there is no such module or attribute.
-        UnknownName: no such name in the table.
-    """
-    found = _find("robot", name, ROBOTS)
-    if not isinstance(found, RobotSpec):
-        raise InvalidInput(f"robot {name!r}: expected a RobotSpec, got {found!r}")
-    return found
-
-
-def _find(kind: str, name: str, table: dict[str, str]) -> Any:
-    if ":" not in name:
-        return lookup(kind, name, table)
-    try:
-        return lookup(kind, name, {name: name})
-    except (ModuleNotFoundError, AttributeError, ValueError) as error:
-        raise InvalidInput(f"{kind} {name!r}: {error}; give it as module:name") from error
 
 
 @dataclass
@@ -334,7 +298,7 @@ def _opening(shapes: Sequence[_Part], Ts_world_link: dict[str, Array]) -> float:
 @functools.cache
 def _finger_parts(robot_name: str) -> list[_Part]:
     """The convex parts of a robot's finger links."""
-    robot = find_robot(robot_name)
+    robot = get_robot(robot_name)
     model = RobotModel(robot)
     T_tool_world = inverse(model.fk(robot.home))
     found = []
@@ -349,24 +313,24 @@ def _finger_parts(robot_name: str) -> list[_Part]:
 
 @functools.cache
 def _whereabouts(robot_name: str) -> tuple[Array, Array]:
-    robot = find_robot(robot_name)
+    robot = get_robot(robot_name)
     return site(robot), ready_joints(robot)
 
 
 def make_bench(
     backend_name: str, robot_name: str, scene_name: str = "plain", scene: SceneSpec | None = None
 ) -> Bench:
-    """A backend of either kind of name, with a robot, in one of `SCENES`, reset.
+    """A backend with a robot, in one of `SCENES`, reset.
 
     Args:
-        backend_name: one of `BACKENDS` or `module:Class`.
-        robot_name: one of `ROBOTS` or `module:SPEC`.
+        backend_name: one of `BACKENDS` or a reference.
+        robot_name: one of `ROBOTS` or a reference.
         scene_name: one of `SCENES`.
         scene: in place of that scene.
     """
-    robot = find_robot(robot_name)
+    robot = get_robot(robot_name)
     scene = scene or SCENES[scene_name](robot)
-    backend = find_backend(backend_name)(robot, scene, 64)
+    backend = get_backend(backend_name)(robot, scene, 64)
     model = RobotModel(robot, scene.held)
     here, ready = _whereabouts(robot_name)
     bench = Bench(backend_name, robot_name, scene_name, backend, scene, model, here, ready, ready)

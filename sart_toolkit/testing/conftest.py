@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from sart_toolkit.backends import BACKENDS
+from sart_toolkit.backends import BACKENDS, get_backend
 from sart_toolkit.backends.interface import KnowsBodies, Resets, SensesContacts
 from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import ROBOTS
 from sart_toolkit.scenes.spec import SceneSpec
-from sart_toolkit.testing.bench import Bench, find_backend, make_bench
+from sart_toolkit.testing.bench import Bench, make_bench
 
 Make = Callable[..., Bench]
 
@@ -33,7 +33,7 @@ def target(request: pytest.FixtureRequest) -> tuple[str, str]:
     """The names of backend and robot."""
     backend, robot = request.param
     try:
-        find_backend(backend)
+        get_backend(backend)
     except MissingExtra as error:
         pytest.skip(str(error))
     return backend, robot

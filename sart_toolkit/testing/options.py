@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,15 +15,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--sart-backend",
         action="append",
         metavar="NAME",
-        help="backend to test with `--pyargs sart_toolkit.testing`: one of BACKENDS or "
-        "module:Class; may be repeated (default: all BACKENDS)",
+        help="backend to test with `--pyargs sart_toolkit.testing`: one of BACKENDS, "
+        "module:Class or file.py:Class; may be repeated (default: all BACKENDS)",
     )
     group.addoption(
         "--sart-robot",
         action="append",
         metavar="NAME",
-        help="robot to test it with: one of ROBOTS or module:SPEC; may be repeated "
-        "(default: all ROBOTS)",
+        help="robot to test it with: one of ROBOTS, module:SPEC or file.py:SPEC; may be "
+        "repeated (default: all ROBOTS)",
     )
 
 
@@ -42,16 +40,14 @@ def pytest_configure(config: pytest.Config) -> None:
     # Not imported by every run of pytest where the toolkit is installed.
     import pytest
 
-    from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
-    from sart_toolkit.testing.bench import find_backend, find_robot
+    from sart_toolkit.backends import get_backend
+    from sart_toolkit.errors import MissingExtra, UnknownName
+    from sart_toolkit.robots import get_robot
 
-    if os.getcwd() not in sys.path:
-        # As with `python -m pytest`: a module in the working folder can be named.
-        sys.path.append(os.getcwd())
     try:
         for name in robots:
-            find_robot(name)
+            get_robot(name)
         for name in backends:
-            find_backend(name)
-    except (InvalidInput, MissingExtra, UnknownName) as error:
+            get_backend(name)
+    except (MissingExtra, UnknownName) as error:
         raise pytest.UsageError(str(error)) from error

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sart_toolkit.backends import get_backend
 from sart_toolkit.backends.interface import (
     Draws,
     KnowsBodies,
@@ -19,14 +20,14 @@ from sart_toolkit.data.records import Rates
 from sart_toolkit.errors import InvalidInput, MissingCapability, UnknownName
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.scenes.spec import Body, SceneSpec, SceneState
-from sart_toolkit.testing.bench import ABILITIES, Bench, find_backend
+from sart_toolkit.testing.bench import ABILITIES, Bench
 
 Make = Callable[..., Bench]
 
 
 def test_name_and_abilities_are_known_before_connecting(target: tuple[str, str]) -> None:
     """They are the class's own."""
-    backend = find_backend(target[0])
+    backend = get_backend(target[0])
     assert isinstance(backend.name, str)
     if issubclass(backend, SavesStates):
         # Radii around a waypoint are not much larger.
@@ -41,7 +42,7 @@ def test_rates_are_those_asked_for(bench: Bench) -> None:
     bench.wait(1 / bench.hz)
     right = bench.see().time - start == pytest.approx(1 / bench.hz, abs=1e-9)
     bench.relies_on(right, "test_a_step_advances_time_by_one_control_period")
-    made = find_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16, rates)
+    made = get_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16, rates)
     assert made.rates == rates
     before = made.observe()
     made.command(before.q, float(np.clip(before.gripper, 0, 1)))
@@ -109,7 +110,7 @@ def test_two_instances_are_independent(bench: Bench, another: Make) -> None:
 def test_closing_twice_does_nothing(bench: Bench) -> None:
     """So that a `finally` may close what was closed."""
     before = bench.digest()
-    made = find_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16)
+    made = get_backend(bench.backend_name)(bench.backend.robot, bench.scene, 16)
     made.close()
     made.close()
     assert bench.digest() == before
@@ -117,7 +118,7 @@ def test_closing_twice_does_nothing(bench: Bench) -> None:
 
 def test_closing_one_instance_leaves_others_alone(bench: Bench) -> None:
     """Neither the first close nor the second reaches somebody else's simulator."""
-    make = find_backend(bench.backend_name)
+    make = get_backend(bench.backend_name)
     made, kept = (make(bench.backend.robot, bench.scene, 16) for _ in range(2))
     if isinstance(kept, Resets):
         kept.reset(bench.state())

@@ -7,12 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sart_toolkit.backends import get_backend
 from sart_toolkit.backends.interface import CameraView, Draws, Resets
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import Array, inverse, pose
 from sart_toolkit.robots.spec import ImageSize, check_image_size
 from sart_toolkit.scenes.spec import SceneState
-from sart_toolkit.testing.bench import Bench, find_backend
+from sart_toolkit.testing.bench import Bench
 from sart_toolkit.testing.scenes import DOT_OFFSET, DOT_THICKNESS, ROOM_HALF_WIDTH
 
 _SIZE = 128
@@ -252,7 +253,7 @@ def test_drawing_changes_nothing(view: Bench) -> None:
 def test_a_picture_without_pixels_is_refused(view: Bench, size: int) -> None:
     """When it is made and when it is asked for."""
     with pytest.raises(InvalidInput, match="image_size"):
-        find_backend(view.backend_name)(view.backend.robot, view.scene, size)
+        get_backend(view.backend_name)(view.backend.robot, view.scene, size)
     with pytest.raises(InvalidInput, match="image_size"):
         view.see((_wrist(view),), size)
 

@@ -15,12 +15,11 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from sart_toolkit.augment import engine
+from sart_toolkit.augment import STRATEGIES, engine
 from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration, augment_sources
 from sart_toolkit.augment.executors import Attempt, RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
-from sart_toolkit.augment.strategies import STRATEGIES
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends.interface import Contact, KnowsBodies, Resets, SavesStates
 from sart_toolkit.data import writer

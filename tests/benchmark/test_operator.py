@@ -7,7 +7,7 @@ import pytest
 from sart_toolkit.benchmark.operator import BenchmarkConfig, benchmark_operator
 from sart_toolkit.errors import InvalidInput, Mismatch, OutputExists
 from sart_toolkit.tasks.peg_in_hole import PegInHole
-from sart_toolkit.tasks.task import Stage
+from sart_toolkit.tasks.task import PlanStep
 
 
 class LazyPeg(PegInHole):
@@ -15,7 +15,7 @@ class LazyPeg(PegInHole):
 
     def plan(self, state):
         T = super().plan(state)[0].T_world_tool
-        return [Stage(T, state.gripper, 0.1)]
+        return [PlanStep(T, state.gripper, 0.1)]
 
 
 class FarPeg(PegInHole):

@@ -37,7 +37,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.peg_in_hole import PegInHole
-from sart_toolkit.tasks.task import Stage, Task
+from sart_toolkit.tasks.task import PlanStep, Task
 
 PEG = "peg_in_hole/pybullet"
 LID = "lid_closing/pybullet"
@@ -50,9 +50,9 @@ class Interrupted(Exception):
 class LazyPeg(PegInHole):
     """An operator that never goes down."""
 
-    def plan(self, state: Any) -> list[Stage]:
+    def plan(self, state: Any) -> list[PlanStep]:
         T = super().plan(state)[0].T_world_tool
-        return [Stage(T, state.gripper, 0.1)]
+        return [PlanStep(T, state.gripper, 0.1)]
 
 
 def counted(result: dict[str, Any]) -> Any:

@@ -141,7 +141,7 @@ def test_at_a_terminal_mistakes_are_told_and_ctrl_c_keeps_the_work(demo, wait_un
     type_("q", "aren't saved")
     said.clear()
     process.send_signal(signal.SIGINT)
-    says("type the same command again to go on")()
+    says("type the same command again to resume")()
     assert process.wait(30) == 130
     os.close(here)
     assert demo.with_name("demo.annotation.json.journal").exists()

@@ -11,17 +11,17 @@ from sart_toolkit.tasks.task import Placement
 
 
 @pytest.fixture(scope="module")
-def stages(peg_task, peg_model):
+def plan(peg_task, peg_model):
     return peg_task.plan(peg_task.initial_state(peg_model, Placement()))
 
 
 @pytest.fixture
-def record(make_peg_backend, peg_task, peg_model, stages):
+def record(make_peg_backend, peg_task, peg_model, plan):
     """Records in a backend of its own, so that nothing carries over."""
 
     def record(rng, style=None):
         backend = make_peg_backend()
-        operator = ScriptedOperator(stages, rng, style)
+        operator = ScriptedOperator(plan, rng, style)
         demonstration = record_demonstration(backend, peg_task, peg_model, operator)
         backend.close()
         return demonstration
@@ -41,25 +41,25 @@ def test_another_rng_gives_another_demonstration(record, peg_demonstration):
     assert other.success[-1]
 
 
-def test_speed_is_a_person_s_and_the_end_is_still(peg_demonstration, stages):
+def test_speed_is_a_person_s_and_the_end_is_still(peg_demonstration, plan):
     positions = peg_demonstration.steps.measured_Ts_world_tool[:, :3, 3]
     speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) * DEFAULT_RATES.record_hz
-    assert speed.max() < 1.3 * max(stage.speed for stage in stages)
+    assert speed.max() < 1.3 * max(step.speed for step in plan)
     assert speed[-4:].max() < 0.005
     assert 2.0 < len(peg_demonstration) / DEFAULT_RATES.record_hz < 12.0
 
 
-def test_without_noise_the_last_leg_s_goal_is_met_within_its_tolerance(record, stages):
+def test_without_noise_the_last_leg_s_goal_is_met_within_its_tolerance(record, plan):
     calm = OperatorStyle(tremor=0.0, tremor_deg=0.0, hesitation=0.0)
     demonstration = record(np.random.default_rng(0), calm)
     assert demonstration.content_hash() == record(np.random.default_rng(9), calm).content_hash()
     at = demonstration.steps.measured_Ts_world_tool[-1, :3, 3]
-    goal = stages[-1].T_world_tool[:3, 3]
-    assert np.linalg.norm(at - goal) < stages[-1].tolerance + 0.001
+    goal = plan[-1].T_world_tool[:3, 3]
+    assert np.linalg.norm(at - goal) < plan[-1].tolerance + 0.001
 
 
-def test_a_plan_without_a_stage_is_refused():
-    with pytest.raises(InvalidInput, match="the plan has no stage"):
+def test_a_plan_without_a_step_is_refused():
+    with pytest.raises(InvalidInput, match="the plan has no step"):
         ScriptedOperator([], np.random.default_rng(0))
 
 

@@ -14,7 +14,7 @@ from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.tasks.task import Stage
+from sart_toolkit.tasks.task import PlanStep
 
 
 @pytest.fixture(scope="module")
@@ -38,13 +38,13 @@ def demonstrate(
     task = request.module.TASK
 
     def demonstrate(
-        change: Callable[[list[Stage]], list[Stage]] = lambda stages: stages,
+        change: Callable[[list[PlanStep]], list[PlanStep]] = lambda plan: plan,
         placement: object = None,
         cameras: tuple[str, ...] = (),
     ) -> Demonstration:
         placement = placement or request.module.PLACEMENT
-        stages = change(task.plan(task.initial_state(model, placement)))
-        operator = ScriptedOperator(stages, np.random.default_rng(5))
+        plan = change(task.plan(task.initial_state(model, placement)))
+        operator = ScriptedOperator(plan, np.random.default_rng(5))
         config = SessionConfig(cameras=cameras, keep_states=False)
         return record_demonstration(backend, task, model, operator, placement, config=config)
 

@@ -9,40 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from sart_toolkit.backends.pybullet import PyBulletBackend
-from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
+from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import ROBOTS, get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.testing import bench as bench_module
 from sart_toolkit.testing import options, scenes
-from sart_toolkit.testing.bench import find_backend, find_robot, make_bench
+from sart_toolkit.testing.bench import make_bench
 
 ROOT = Path(__file__).parents[2]
-
-
-def test_a_backend_is_found_in_the_table_and_as_module_and_class():
-    assert find_backend("pybullet") is PyBulletBackend
-    assert find_backend("sart_toolkit.backends.pybullet:PyBulletBackend") is PyBulletBackend
-
-
-def test_a_robot_is_found_in_the_table_and_as_module_and_spec():
-    assert find_robot("ur5e_2f85") is find_robot("sart_toolkit.robots.ur5e_2f85:SPEC")
-
-
-@pytest.mark.parametrize("find", [find_backend, find_robot])
-@pytest.mark.parametrize(
-    ("name", "error", "message"),
-    [
-        ("pybulet_2f85", UnknownName, "choose from"),
-        ("no_such_module:Thing", InvalidInput, "No module named 'no_such_module'.*module:name"),
-        ("sart_toolkit.poses:Thing", InvalidInput, "no attribute 'Thing'"),
-        ("sart_toolkit.poses:", InvalidInput, "module:name"),
-        ("sart_toolkit.poses:pose", InvalidInput, "expected a .*(Backend|RobotSpec)"),
-    ],
-)
-def test_a_name_that_names_nothing_is_refused(find, name, error, message):
-    with pytest.raises(error, match=message):
-        find(name)
 
 
 def test_a_wrong_name_on_the_command_line_is_a_usage_error(run_pytest, tmp_path):

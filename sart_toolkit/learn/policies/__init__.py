@@ -5,9 +5,12 @@ A new policy is one file with a `Policy` and one line in `POLICIES`.
 
 from __future__ import annotations
 
-from sart_toolkit.errors import InvalidInput
-from sart_toolkit.learn.policy import Policy
-from sart_toolkit.registry import lookup
+from typing import TYPE_CHECKING
+
+from sart_toolkit.registry import expect_class, resolve
+
+if TYPE_CHECKING:
+    from sart_toolkit.learn.policy import Policy
 
 POLICIES = {
     "compact_mlp": "sart_toolkit.learn.policies.compact_mlp:CompactMLP",
@@ -15,14 +18,12 @@ POLICIES = {
 }
 
 
-def get_policy(name: str) -> type[Policy]:
-    """The class of the policy called `name`.
+def get_policy(policy: str | type[Policy]) -> type[Policy]:
+    """The class that a policy's name or reference names; a class itself is returned.
 
     Raises:
-        UnknownName: no such policy; the message offers the nearest.
-        InvalidInput: what is called so is no subclass of `Policy`.
+        UnknownName: there is none; the message says which part is wrong.
     """
-    policy = lookup("policy", name, POLICIES)
-    if not (isinstance(policy, type) and issubclass(policy, Policy)):
-        raise InvalidInput(f"policy {name!r}: expected a subclass of Policy, got {policy!r}")
-    return policy
+    from sart_toolkit.learn.policy import Policy
+
+    return expect_class("policy", policy, resolve("policy", policy, POLICIES), Policy)

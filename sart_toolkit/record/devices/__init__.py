@@ -1,13 +1,19 @@
 """What steers the tool in teleoperation: keyboard, SpaceMouse, gamepad, or a script.
 
 A new device is one file and one line in `DEVICES`: what is named there is called with a
-`DeviceSetup`.
+`DeviceSetup`. One outside the repository needs no line, `package.module:NAME` or
+`path/to/file.py:NAME` names it.
 """
 
 from __future__ import annotations
 
-from sart_toolkit.record.session import Device, DeviceSetup
-from sart_toolkit.registry import lookup
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from sart_toolkit.registry import expect, resolve
+
+if TYPE_CHECKING:
+    from sart_toolkit.record.session import Device, DeviceSetup
 
 DEVICES = {
     "scripted": "sart_toolkit.record.scripted:scripted_operator",
@@ -17,16 +23,17 @@ DEVICES = {
 }
 
 
-def make_device(name: str, setup: DeviceSetup) -> Device:
-    """The device called `name`, made for a recording; one that a person holds isn't connected yet.
+def make_device(device: str | Callable[[DeviceSetup], Device], setup: DeviceSetup) -> Device:
+    """A device made for a recording; one that a person holds isn't connected yet.
 
     Args:
-        name: one of `DEVICES`.
+        device: what makes it, or a name or reference that names that.
         setup: what the recording is of.
 
     Raises:
-        UnknownName: no such device; the message offers the nearest.
+        UnknownName: no such device; the message says which part is wrong.
     """
-    made = lookup("device", name, DEVICES)(setup)
-    assert isinstance(made, Device)
-    return made
+    from sart_toolkit.record.session import Device
+
+    make = resolve("device", device, DEVICES)
+    return expect("device", device, make(setup) if callable(make) else make, Device)

@@ -1,0 +1,118 @@
+"""`sart info`, and what the verbs say of what they made."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sart_toolkit.cli.arguments import Info
+from sart_toolkit.data.dataset import MANIFEST, Dataset, load_dataset
+from sart_toolkit.data.records import Demonstration
+from sart_toolkit.data.storage import load_annotation, load_recording, read_json
+from sart_toolkit.errors import BrokenFile, MissingFile
+
+
+def info_verb(args: Info) -> dict[str, Any]:
+    """`sart info`: by what the file or directory holds."""
+    path = args.file
+    if not path.exists():
+        raise MissingFile(f"{path}: no such file or directory; check the path")
+    if path.is_dir():
+        if (path / "run.json").exists():
+            state = read_json(path / "run.json")
+            return {"kind": "run", **state["config"], "stages": state["stages"]}
+        if (path / "model.safetensors").exists():
+            return {"kind": "skill", **describe_skill(path)}
+        if (path / MANIFEST).exists():
+            return {"kind": "dataset", **describe_dataset(load_dataset(path))}
+        raise BrokenFile(f"{path}: holds no run, skill or dataset; pass another directory")
+    if path.suffix == ".json":
+        value = read_json(path)
+        if "spheres" in value:
+            spheres = load_annotation(path).spheres
+            return {
+                "kind": "annotation",
+                "demonstration": value["demonstration_hash"],
+                "spheres": [
+                    f"waypoint {s.waypoint}: {s.radius * 1e3:.1f} mm ({s.source})" for s in spheres
+                ],
+            }
+        if "success_rate" in value:
+            return {"kind": "evaluation", **without_rows(value)}
+        raise BrokenFile(f"{path}: neither an annotation nor an evaluation; pass another file")
+    recording = load_recording(path)
+    if isinstance(recording, Demonstration):
+        return {"kind": "demonstration", **describe_demonstration(recording)}
+    return {"kind": "episode", "steps": len(recording), **plain(recording.provenance)}
+
+
+def describe_demonstration(demonstration: Demonstration) -> dict[str, Any]:
+    """A demonstration in a few words."""
+    d = demonstration
+    return {
+        "task": d.task,
+        "robot": d.robot,
+        "backend": d.backend,
+        "waypoints": len(d),
+        "seconds": float(d.timestamps[-1]),
+        "success": bool(d.success[-1]),
+        "placement": dict(d.task_parameters.get("placement", {})),
+        "cameras": {k: "x".join(map(str, c.rgb.shape[2:0:-1])) for k, c in d.steps.cameras.items()},
+        "operator": d.operator,
+        "device": d.device,
+        "seconds_spent": round(d.seconds, 1),
+        "content_hash": d.content_hash(),
+    }
+
+
+def describe_dataset(dataset: Dataset) -> dict[str, Any]:
+    """A dataset in a few words."""
+    keys = (
+        "task",
+        "n_trajectories",
+        "n_kept",
+        "n_attempted",
+        "rejections",
+        "seconds",
+        "content_hash",
+    )
+    return {k: dataset.info[k] for k in keys}
+
+
+def describe_skill(path: Path) -> dict[str, Any]:
+    """A skill's directory in a few words, from its JSON alone."""
+    config, training = read_json(path / "config.json"), read_json(path / "training.json")
+    try:
+        return {
+            "task": config["task"],
+            "robot": config["robot"],
+            "policy": config["training"]["policy"],
+            "epochs": config["training"]["epochs"],
+            "image_size": config["training"]["image_size"],
+            "trajectories": training["trajectories"],
+            "final_loss": training["final_loss"],
+            "seconds": training["seconds"],
+            "images_per_second": training["images_per_second"],
+        }
+    except (KeyError, TypeError) as error:
+        raise BrokenFile(f"{path}: {error} is missing or wrong; train it again") from error
+
+
+def without_rows(evaluation: dict[str, Any]) -> dict[str, Any]:
+    """The figures of an evaluation, without what it lists for each episode."""
+    rows = ("episodes", "versions", "config", "seeds", "videos")
+    return {k: v for k, v in evaluation.items() if k not in rows}
+
+
+def plain(record: Any) -> dict[str, Any]:
+    """A dataclass as JSON values."""
+
+    def simple(value: Any) -> Any:
+        return value.tolist() if isinstance(value, np.ndarray) else str(value)
+
+    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(record), default=simple))
+    return plain

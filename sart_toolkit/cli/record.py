@@ -1,0 +1,43 @@
+"""`sart record`: by the scripted operator, or by hand in a window."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sart_toolkit import pipeline
+from sart_toolkit.cli.arguments import Record
+from sart_toolkit.cli.console import ProgressDisplay
+from sart_toolkit.cli.info import describe_demonstration
+
+
+def record_verb(args: Record) -> dict[str, Any]:
+    """`sart record`."""
+    by_hand = [n for n in ("frame", "operator", "status") if getattr(args, n) is not None]
+
+    def steer(*recording: Any) -> Any:
+        from sart_toolkit.cli.teleop import record_by_hand
+
+        return record_by_hand(args, *recording)
+
+    with ProgressDisplay() as progress:
+        demonstration = pipeline.record(
+            args.task,
+            args.out,
+            robot=args.robot,
+            backend=args.backend,
+            device=args.device,
+            steer=steer,
+            by_hand=by_hand,
+            frame=args.frame or "world",
+            operator=args.operator or "person",
+            max_seconds=args.max_seconds,
+            placement=args.placement,
+            yaw_deg=args.yaw_deg,
+            vary_looks=args.vary_looks,
+            cameras=args.cameras.split(","),
+            image_size=args.image_size,
+            seed=args.seed,
+            overwrite=args.overwrite,
+            progress=progress,
+        )
+    return {"demonstration": str(args.out), **describe_demonstration(demonstration)}

@@ -1,0 +1,40 @@
+"""`sart run` and `sart report`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sart_toolkit import pipeline
+from sart_toolkit.cli.arguments import Report, Run
+from sart_toolkit.cli.console import ProgressDisplay, typed
+
+
+def run_verb(args: Run) -> dict[str, Any]:
+    """`sart run`."""
+    with ProgressDisplay() as progress:
+        return pipeline.run(
+            args.task,
+            args.out,
+            robot=args.robot,
+            backend=args.backend,
+            strategy=args.strategy,
+            policy=args.policy,
+            n=args.n,
+            episodes=args.episodes,
+            epochs=args.epochs,
+            distribution=args.distribution,
+            cameras=args.cameras.split(","),
+            image_size=args.image_size,
+            seed=args.seed,
+            eval_seed=args.eval_seed,
+            workers=args.workers,
+            device=args.device,
+            overwrite=args.overwrite,
+            command=typed(),
+            progress=progress,
+        )
+
+
+def report_verb(args: Report) -> dict[str, Any]:
+    """`sart report`."""
+    return {"report": str(pipeline.report(args.run, args.out, overwrite=args.overwrite))}

@@ -1,0 +1,780 @@
+"""The stages from a demonstration to a report, and all of them in a row: what `sart` calls.
+
+Robots, tasks, backends, strategies and policies are given as names, references (see `registry`) or
+objects. Later stages find those of a recording by the references that it holds, unless others are
+given. What can be refused is refused before torch or a simulator is imported, which is why these
+imports stand in the functions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import logging
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from sart_toolkit.augment import STRATEGIES
+from sart_toolkit.backends import BACKENDS, get_backend, make_backend
+from sart_toolkit.data.dataset import Dataset, load_dataset
+from sart_toolkit.data.records import (
+    DEFAULT_RATES,
+    Annotation,
+    Demonstration,
+    Rates,
+    Referring,
+    library_versions,
+)
+from sart_toolkit.data.storage import (
+    check_writable,
+    clear_directory,
+    load_annotation,
+    load_demonstration,
+    read_json,
+    save_annotation,
+    save_demonstration,
+    write_json,
+)
+from sart_toolkit.doctor import machine
+from sart_toolkit.errors import InvalidInput, Mismatch, MissingFile, UnknownName
+from sart_toolkit.learn.policies import POLICIES
+from sart_toolkit.record.devices import DEVICES, make_device
+from sart_toolkit.registry import check_known, reference_to
+from sart_toolkit.robots import ROBOTS, get_robot
+from sart_toolkit.robots.spec import check_image_size
+from sart_toolkit.tasks import TASKS, get_task
+
+if TYPE_CHECKING:
+    from sart_toolkit.augment.strategies import Strategy
+    from sart_toolkit.augment.validate import Validation
+    from sart_toolkit.backends.interface import Backend, BackendFactory
+    from sart_toolkit.collision.world import CollisionWorld
+    from sart_toolkit.evaluate.rollout import Film, Rollout
+    from sart_toolkit.learn.policy import Policy
+    from sart_toolkit.learn.skill import SkillConfig
+    from sart_toolkit.learn.training import TrainConfig
+    from sart_toolkit.record.session import Device, DeviceSetup, SessionConfig
+    from sart_toolkit.robots.spec import ImageSize, RobotSpec
+    from sart_toolkit.tasks.task import Placement, Task
+
+    RobotLike = str | RobotSpec
+    TaskLike = str | Task | type[Task]
+    BackendLike = str | type[Backend]
+    Steer = Callable[[DeviceSetup, Device, Placement, SessionConfig], Demonstration]
+
+_log = logging.getLogger(__name__)
+_TABLES: Mapping[str, Mapping[str, str]] = {
+    "backend": BACKENDS,
+    "device": DEVICES,
+    "policy": POLICIES,
+    "robot": ROBOTS,
+    "strategy": STRATEGIES,
+    "task": TASKS,
+}
+Kind = Literal["robot", "task", "backend"]
+
+
+class Progress(Protocol):
+    """Hears how far a stage is: its name, what is done of the total (if known), and a few words."""
+
+    def __call__(
+        self, stage: str, done: float, total: float | None = None, text: str = "", /
+    ) -> None: ...
+
+
+def _silent(stage: str, done: float, total: float | None = None, text: str = "", /) -> None:
+    pass
+
+
+def check_names(**references: Any) -> None:
+    """Return if what is named exists: `check_names(task="peg_in_hole", robot=None)`.
+
+    Raises:
+        UnknownName: there is no such name, module or file.
+    """
+    for kind, reference in references.items():
+        check_known(kind, reference, _TABLES[kind])
+
+
+# --- what a recording notes ---------------------------------------------------------------------
+
+
+def noted(
+    demonstration: Demonstration,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+) -> Demonstration:
+    """The demonstration with the references of what is given in place of those that it holds."""
+    given = {"task": task, "robot": robot, "backend": backend}
+    found = {
+        kind: reference_to(kind, value, _TABLES[kind])
+        for kind, value in given.items()
+        if value is not None
+    }
+    references = {kind: reference for kind, reference in found.items() if reference is not None}
+    return dataclasses.replace(demonstration, references={**demonstration.references, **references})
+
+
+Found = TypeVar("Found")
+
+
+def _find(shown: Referring, kind: Kind, given: Any, get: Callable[[Any], Found]) -> Found:
+    """What is given, or else what a recording notes."""
+    if given is not None:
+        return get(given)
+    try:
+        return get(shown.reference(kind))
+    except UnknownName as error:
+        raise UnknownName(
+            f"{error}; it is what the recording notes: name another with --{kind} REF"
+        ) from error
+
+
+def task_of(shown: Referring, task: TaskLike | None = None) -> Task:
+    """The task of a recording or skill, or the one given.
+
+    Raises:
+        UnknownName: it can't be found.
+    """
+    return _find(shown, "task", task, get_task)
+
+
+def robot_of(shown: Referring, robot: RobotLike | None = None) -> RobotSpec:
+    """The robot of a recording or skill, or the one given.
+
+    Raises:
+        UnknownName: it can't be found.
+    """
+    return _find(shown, "robot", robot, get_robot)
+
+
+def backend_maker(
+    shown: Referring,
+    image_size: ImageSize,
+    rates: Rates = DEFAULT_RATES,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+) -> BackendFactory:
+    """Makes the backend of a recording or skill with its robot in its scene; picklable.
+
+    Raises:
+        UnknownName: the robot, the task or the backend can't be found.
+    """
+    scene = task_of(shown, task).scene
+    made = _find(shown, "backend", backend, get_backend)
+    return functools.partial(make_backend, made, robot_of(shown, robot), scene, image_size, rates)
+
+
+def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
+    """Width and height of its pictures [pixels].
+
+    Raises:
+        InvalidInput: it holds none.
+    """
+    for camera in demonstration.steps.cameras.values():
+        height, width = camera.rgb.shape[1:3]
+        return width, height
+    raise InvalidInput("the demonstration holds no pictures; record it with a camera")
+
+
+def _image_size_of_skill(skill: SkillConfig) -> tuple[int, int]:
+    """Width and height [pixels] of the pictures that a skill was shown."""
+    height, width = skill.cameras[skill.training.cameras[0]].size
+    return width, height
+
+
+def _checked_size(image_size: ImageSize) -> tuple[int, int]:
+    size = check_image_size(image_size)
+    if min(size) < 16:
+        raise InvalidInput(f"image_size: expected at least 16 pixels, got {image_size}")
+    return size
+
+
+# --- the stages ---------------------------------------------------------------------------------
+
+
+def record(
+    task: TaskLike,
+    out: Path,
+    *,
+    robot: RobotLike | None = None,
+    backend: BackendLike = "pybullet",
+    device: str | Callable[[DeviceSetup], Device] = "scripted",
+    steer: Steer | None = None,
+    by_hand: Collection[str] = (),
+    frame: Literal["world", "tool"] = "world",
+    operator: str = "person",
+    max_seconds: float = 120.0,
+    placement: Literal["middle", "random"] = "middle",
+    yaw_deg: float = 0.0,
+    vary_looks: bool = False,
+    cameras: Sequence[str] = ("wrist",),
+    image_size: ImageSize = 128,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> Demonstration:
+    """One demonstration, recorded and saved in the file `out`.
+
+    Args:
+        task: what is shown.
+        out: HDF5 file to write.
+        robot: the task's own if left out.
+        backend: where it is shown.
+        device: what steers.
+        steer: follows a device that a person holds, and saves what came of it.
+        by_hand: flags that mean nothing to any other device, which are refused with one.
+        frame: what a person's directions are fixed to at first.
+        operator: who steers, where it is a person.
+        max_seconds: the longest it may take [s].
+        placement: where the object stands in its range.
+        yaw_deg: a random placement is also turned within ± this [deg].
+        vary_looks: whether colours, light and the wrist camera's mounting vary.
+        cameras: whose pictures are recorded.
+        image_size: width and height of pictures [pixels]; one number for a square.
+        seed: of all that is random.
+        overwrite: whether `out` may be replaced.
+        progress: hears of the seconds recorded.
+
+    Raises:
+        UnknownName: a name or reference leads to nothing.
+        InvalidInput: options don't fit each other, or a value is not acceptable.
+        Mismatch: the goal was not reached.
+        OutputExists, CannotWrite: `out` can't be written.
+    """
+    check_names(task=task, robot=robot, backend=backend, device=device)
+    size = _checked_size(image_size)
+    if yaw_deg and placement == "middle":
+        raise InvalidInput("--yaw-deg: turns random placements only; add --placement random")
+    check_writable(out, overwrite)
+    from sart_toolkit.record.session import DeviceSetup, SessionConfig, record_demonstration
+    from sart_toolkit.robots.model import RobotModel
+    from sart_toolkit.scenes.appearance import vary_appearance
+    from sart_toolkit.tasks.task import Placement
+
+    found = get_task(task)
+    spec, scene = get_robot(robot or found.robot), found.scene
+    rng = np.random.default_rng(seed)
+    at = found.sample_placement(rng, yaw_deg) if placement == "random" else Placement()
+    references = {
+        "task": reference_to("task", task if isinstance(task, str) else found, TASKS),
+        "robot": reference_to("robot", robot or found.robot, ROBOTS),
+        "backend": reference_to("backend", backend, BACKENDS),
+    }
+    config = SessionConfig(
+        tuple(cameras),
+        max_seconds,
+        references={k: v for k, v in references.items() if v is not None},
+    )
+    if vary_looks:
+        spec, scene = vary_appearance(spec, scene, np.random.default_rng([seed, 1]))
+    with closing(make_backend(backend, spec, scene, size)) as made:
+        model = RobotModel(made.robot, made.scene.held)
+        setup = DeviceSetup(
+            made, found, model, found.initial_state(model, at), rng, frame, operator
+        )
+        steered = make_device(device, setup)
+        if steered.interactive:
+            if steer is None:
+                raise InvalidInput(
+                    f"device {steered.name!r}: is for a person's hands; record with `sart record`"
+                )
+            return steer(setup, steered, at, config)
+        for flag in by_hand:
+            raise InvalidInput(
+                f"--{flag}: is for a device that a person holds; add --device keyboard, say"
+            )
+        demonstration = record_demonstration(
+            made, found, model, steered, at, seed, config, lambda t: progress("record", t)
+        )
+    achieved = found.achieved(demonstration.success, demonstration.rates.record_hz)
+    if demonstration.judged_by == "task" and not achieved:
+        raise Mismatch("the demonstration did not reach the goal; record again with another --seed")
+    save_demonstration(out, demonstration)
+    return demonstration
+
+
+def world_of(
+    demonstration: Demonstration,
+    source: Literal["scene", "cloud"] = "scene",
+    unknown: Literal["behind", "free"] = "behind",
+    slip_tolerance: float = 0.005,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+) -> CollisionWorld:
+    """Where the obstacles of a demonstration are, from its scene or from its pictures alone."""
+    from sart_toolkit.collision.cloud import CloudConfig
+    from sart_toolkit.collision.world import make_world
+
+    spec, scene = robot_of(demonstration, robot), task_of(demonstration, task).scene
+    cloud = CloudConfig(unknown=unknown)
+    return make_world(source, demonstration, spec, scene, slip_tolerance, cloud)
+
+
+def suggest(
+    demo: Path,
+    out: Path,
+    *,
+    waypoints: tuple[int, ...] = (),
+    source: Literal["scene", "cloud"] = "scene",
+    unknown: Literal["behind", "free"] = "behind",
+    slip_tolerance: float = 0.005,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    **options: Any,
+) -> Annotation:
+    """Precision spheres suggested for a demonstration's file, saved in the file `out`.
+
+    Args:
+        demo: the demonstration.
+        out: JSON file to write.
+        waypoints: key waypoints; chosen to tile the free part if left out.
+        source: what is known of obstacles.
+        unknown: with "cloud": what space behind what was seen counts as.
+        slip_tolerance: how far what is grasped may move in the grasp [m].
+        task, robot: in place of those that the demonstration notes.
+        overwrite: whether `out` may be replaced.
+        progress: hears of the waypoints done.
+        options: of `SuggestConfig`.
+
+    Raises:
+        MissingFile, BrokenFile: the demonstration can't be read.
+        UnknownName: task or robot can't be found.
+        OutputExists, CannotWrite: `out` can't be written.
+    """
+    check_names(task=task, robot=robot)
+    demonstration = load_demonstration(demo)
+    check_writable(out, overwrite)
+    from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
+
+    config = SuggestConfig(**options)
+    world = world_of(demonstration, source, unknown, slip_tolerance, task, robot)
+    n = len(demonstration)
+    annotation = suggest_annotation(
+        demonstration, world, waypoints or None, config,
+        lambda t: progress("suggest", t + 1, n),
+    )  # fmt: skip
+    progress("suggest", n, n)
+    save_annotation(out, annotation)
+    return annotation
+
+
+def augment(
+    demo: Path,
+    annotation: Path,
+    out: Path,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    **options: Any,
+) -> Dataset:
+    """Trajectories generated from a demonstration's and an annotation's file, in directory `out`.
+
+    Args:
+        demo: the demonstration.
+        annotation: its precision spheres.
+        out: directory to write; an interrupted generation resumes.
+        task, robot, backend: in place of those that the demonstration notes.
+        workers: processes.
+        overwrite: whether `out` may be replaced.
+        progress: hears of the trajectories kept.
+        options: of `AugmentConfig`.
+
+    Raises:
+        MissingFile, BrokenFile: a file can't be read.
+        UnknownName: task, robot or backend can't be found.
+        InvalidInput, Mismatch, MissingCapability, OutputExists, CannotWrite: as
+            `augment_demonstration`.
+    """
+    check_names(task=task, robot=robot, backend=backend, strategy=options.get("strategy", "sart"))
+    demonstration = noted(load_demonstration(demo), task, robot, backend)
+    spheres = load_annotation(annotation)
+    from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.augment.engine import augment_demonstration
+
+    config = AugmentConfig(**options)
+    size, rates = image_size_of(demonstration), demonstration.rates
+    make = backend_maker(demonstration, size, rates, task, robot, backend)
+    return augment_demonstration(
+        demonstration, spheres, make, out, config, workers, overwrite,
+        lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
+    )  # fmt: skip
+
+
+def validate(
+    dataset: Path,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    progress: Progress = _silent,
+) -> Validation:
+    """What came of proving a dataset's segments again.
+
+    Args:
+        dataset: directory from `augment`.
+        task, robot: in place of those that its demonstration notes.
+        progress: hears of the episodes done.
+
+    Raises:
+        MissingFile, BrokenFile, Mismatch: as `validate_dataset`.
+        UnknownName: task or robot can't be found.
+    """
+    check_names(task=task, robot=robot)
+    demonstration = load_dataset(dataset).sources[0].demonstration
+    from sart_toolkit.augment.validate import validate_dataset
+
+    return validate_dataset(
+        dataset, robot_of(demonstration, robot), task_of(demonstration, task).scene,
+        lambda done, wanted: progress("validate", done, wanted),
+    )  # fmt: skip
+
+
+def train_policy(
+    dataset: Path,
+    out: Path,
+    policy: str | type[Policy] = "compact_mlp",
+    *,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    **options: Any,
+) -> TrainConfig:
+    """A skill trained on a dataset's directory, in directory `out`; how it was trained.
+
+    Args:
+        dataset: directory from `augment`.
+        out: directory to write; an interrupted training resumes.
+        policy: what is trained.
+        overwrite: whether a skill in `out` may be replaced.
+        progress: hears of the steps done.
+        options: of `TrainConfig`; the policy's own where left out or None.
+
+    Raises:
+        MissingFile, BrokenFile: the dataset can't be read.
+        UnknownName, InvalidInput: an option is not acceptable.
+        OutputExists, CannotWrite: `out` can't be written.
+    """
+    check_names(policy=policy)
+    generated = load_dataset(dataset)
+    check_writable(out / "config.json", overwrite)
+    from sart_toolkit.learn.skill import save_skill
+    from sart_toolkit.learn.training import train
+
+    config = _train_config(policy, options)
+    if overwrite and (out / "config.json").exists():
+        clear_directory(out, "config.json", overwrite=True)
+    result = train(
+        generated, config, out, lambda done, total, text: progress("train", done, total, text),
+        reading=lambda done, total: progress("read", done, total),
+    )  # fmt: skip
+    save_skill(out, result, generated)
+    return config
+
+
+def _train_config(policy: str | type[Policy], options: Mapping[str, Any]) -> TrainConfig:
+    from sart_toolkit.learn.training import TrainConfig
+
+    given = {name: value for name, value in options.items() if value is not None}
+    return TrainConfig.for_policy(policy, **given)
+
+
+def evaluate(
+    skill: Path,
+    out: Path,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+    workers: int = 1,
+    device: str = "cpu",
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    **options: Any,
+) -> dict[str, Any]:
+    """How a skill's directory fares on random placements, saved in the file `out`.
+
+    Args:
+        skill: the skill.
+        out: JSON file to write; videos go beside it.
+        task, robot, backend: in place of those that the skill notes.
+        workers: processes.
+        device: where the policy runs.
+        overwrite: whether `out` may be replaced.
+        progress: hears of the rollouts done.
+        options: of `EvaluateConfig`.
+
+    Raises:
+        MissingFile, BrokenFile: the skill can't be read.
+        UnknownName: task, robot or backend can't be found.
+        InvalidInput: `workers` is not positive.
+        OutputExists, CannotWrite: `out` can't be written.
+    """
+    check_names(task=task, robot=robot, backend=backend)
+    check_writable(out, overwrite)
+    if not (skill / "config.json").exists():
+        raise MissingFile(f"{skill}: no such skill directory; make it with `sart train`")
+    from sart_toolkit.evaluate.rollout import EvaluateConfig, evaluate_skill
+    from sart_toolkit.learn.skill import load_skill
+
+    config = EvaluateConfig(**options)
+    loaded = load_skill(skill)
+    about, rates = loaded.config, loaded.demonstration.rates
+    make = backend_maker(about, _image_size_of_skill(about), rates, task, robot, backend)
+    film: Film | None = None
+    if config.videos:
+        from sart_toolkit.report.video import film_rollout
+
+        film = film_rollout
+
+    def hear(done: int, wanted: int, successes: int) -> None:
+        progress("evaluate", done, wanted, f"{successes}/{done} succeeded")
+
+    return evaluate_skill(
+        skill, task_of(about, task), make, config, out, workers, device, hear, film
+    )
+
+
+def report(run_dir: Path, out: Path | None = None, *, overwrite: bool = False) -> Path:
+    """Where the page about a run's directory was written: in `out`, or its own `report.html`.
+
+    The run's own page is made again as often as this is called.
+
+    Raises:
+        MissingFile, BrokenFile, InvalidInput, Mismatch: as `write_report`.
+        OutputExists, CannotWrite: `out` can't be written.
+    """
+    if not run_dir.is_dir():
+        raise MissingFile(f"{run_dir}: no such directory; pass one that `sart run` wrote")
+    if out is not None:
+        check_writable(out, overwrite)
+    from sart_toolkit.report.page import write_report
+
+    page = out or run_dir / "report.html"
+    write_report(run_dir, page)
+    return page
+
+
+# --- all of them --------------------------------------------------------------------------------
+
+
+def run(
+    task: TaskLike,
+    out: Path | str,
+    *,
+    robot: RobotLike | None = None,
+    backend: BackendLike = "pybullet",
+    strategy: str | Strategy = "sart",
+    policy: str | type[Policy] = "compact_mlp",
+    n: int = 40,
+    episodes: int = 50,
+    epochs: int | None = None,
+    distribution: Literal["paper", "area"] = "paper",
+    cameras: Sequence[str] = ("wrist",),
+    image_size: ImageSize = 128,
+    seed: int = 0,
+    eval_seed: int = 1000,
+    workers: int = 1,
+    device: str = "auto",
+    overwrite: bool = False,
+    command: str = "sart_toolkit.run",
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """Record, suggest, augment, train, evaluate and report, in directory `out`; its figures.
+
+    A stage whose result is there is not done again; called again after an interruption, the run
+    resumes.
+
+    Args:
+        task: what is to be learned.
+        out: directory to write.
+        robot: the task's own if left out.
+        backend: where all of it happens.
+        strategy: how segments are drawn.
+        policy: what is trained.
+        n: trajectories in all, the demonstration among them.
+        episodes: rollouts with random placements.
+        epochs: of training, the policy's own if None.
+        distribution: how positions are drawn on a sphere.
+        cameras: whose pictures are recorded and trained on.
+        image_size: width and height of recorded pictures [pixels]; one number for a square.
+        seed: of all that is random, except evaluation.
+        eval_seed: of the placements that are evaluated.
+        workers: processes.
+        device: where training and the policy run: "auto", "cpu" or "cuda".
+        overwrite: whether a run in `out` may be replaced.
+        command: how it was asked for, kept with the run.
+        progress: hears of each stage.
+
+    Raises:
+        UnknownName: a name or reference leads to nothing.
+        InvalidInput: a value is not acceptable.
+        Mismatch: `out` holds a run with another configuration, or the goal was not reached.
+        OutputExists, CannotWrite: `out` can't be written.
+    """
+    out = Path(out)
+    check_names(task=task, robot=robot, backend=backend, strategy=strategy, policy=policy)
+    size = _checked_size(image_size)
+    from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.data.sampling import SamplingConfig
+    from sart_toolkit.evaluate.rollout import EvaluateConfig
+
+    # What can't work should be said before anything is written.
+    found = get_task(task)
+    get_robot(robot or found.robot)
+    get_backend(backend)
+    generation: dict[str, Any] = {
+        "n": n, "strategy": strategy, "sampling": SamplingConfig(distribution), "seed": seed,
+    }  # fmt: skip
+    drawn = AugmentConfig(**generation)
+    training: dict[str, Any] = {
+        "epochs": epochs, "cameras": tuple(cameras), "seed": seed, "device": device,
+    }  # fmt: skip
+    trained = _train_config(policy, training)
+    EvaluateConfig(episodes, eval_seed)
+
+    wanted = {
+        "task": _named("task", task, found),
+        "backend": _named("backend", backend, get_backend(backend)),
+        "robot": None if robot is None else _named("robot", robot, get_robot(robot)),
+        "strategy": drawn.strategy,
+        "policy": trained.policy,
+        "n": n,
+        "episodes": episodes,
+        "seed": seed,
+        "eval_seed": eval_seed,
+        "cameras": list(cameras),
+        "image_size": list(size),
+        "distribution": distribution,
+        "epochs": epochs,
+        "device": device,
+    }
+    state = _resumed(out, wanted, overwrite)
+    state |= {"command": command, "versions": library_versions(), "machine": machine()}
+    write_json(out / "run.json", state)
+    demo, spheres, dataset = out / "demo.h5", out / "annotation.json", out / "dataset"
+    skill, evaluation = out / "skill", out / "evaluation.json"
+    steps: list[tuple[str, Path, Callable[[], object]]] = [
+        ("record", demo, lambda: record(
+            task, demo, robot=robot, backend=backend, seed=seed, cameras=cameras, image_size=size,
+            progress=progress,
+        )),
+        ("suggest", spheres, lambda: suggest(
+            demo, spheres, task=task, robot=robot, progress=progress,
+        )),
+        ("augment", dataset / "dataset.json", lambda: augment(
+            demo, spheres, dataset, task=task, robot=robot, backend=backend, workers=workers,
+            progress=progress, **generation,
+        )),
+        ("train", skill / "config.json", lambda: train_policy(
+            dataset, skill, policy, progress=progress, **training,
+        )),
+        ("evaluate", evaluation, lambda: evaluate(
+            skill, evaluation, task=task, robot=robot, backend=backend, workers=workers,
+            device=device, progress=progress, episodes=episodes, eval_seed=eval_seed, videos=2,
+        )),
+    ]  # fmt: skip
+    for name, result, carry_out in steps:
+        if result.exists():
+            _log.info("%-9s done before: %s", name, result)
+            continue
+        started = time.perf_counter()
+        try:
+            carry_out()
+        finally:
+            # Also what an interrupted stage took, which will resume.
+            seconds = state["stages"].get(name, 0.0) + time.perf_counter() - started
+            state["stages"][name] = seconds
+            write_json(out / "run.json", state)
+        _log.info("%-9s %6.1f s  %s", name, seconds, result)
+    page = report(out)
+    figures, generated = read_json(evaluation), read_json(dataset / "dataset.json")
+    return {
+        "task": found.name,
+        "success": f"{figures['n_success']}/{figures['n_episodes']}",
+        "success_rate": figures["success_rate"],
+        "ci95": figures["ci95"],
+        "kept": generated["n_kept"],
+        "attempted": generated["n_attempted"],
+        "stages_seconds": {k: round(v, 1) for k, v in state["stages"].items()},
+        "seconds": round(sum(state["stages"].values()), 1),
+        "skill": str(skill),
+        "report": str(page),
+    }
+
+
+def _named(kind: str, given: Any, found: Any) -> str:
+    """What a person gave as text, or else what names the object; at least its own name."""
+    name: str = found.name
+    return reference_to(kind, given, _TABLES[kind]) or name
+
+
+def _resumed(out: Path, wanted: Mapping[str, Any], overwrite: bool) -> dict[str, Any]:
+    """The state of the run in `out`, or of a new one where there is none or it is replaced."""
+    if overwrite:
+        clear_directory(out, "run.json", overwrite=True)
+    elif (out / "run.json").exists():
+        state = read_json(out / "run.json")
+        if state["config"] != wanted:
+            changed = [k for k, v in wanted.items() if state["config"].get(k) != v]
+            raise Mismatch(
+                f"{out}: holds a run with another {', '.join(changed)}; add --overwrite or choose "
+                "another --out"
+            )
+        return state
+    else:
+        check_writable(out)
+    return {"config": wanted, "stages": {}}
+
+
+def run_skill(
+    skill: Path | str,
+    *,
+    placement: Placement | None = None,
+    seed: int = 0,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+    device: str = "cpu",
+    watch: Callable[[Any, int, bool], None] | None = None,
+) -> Rollout:
+    """One rollout of a skill's directory, on the robot, task and backend that it notes.
+
+    Args:
+        skill: the directory.
+        placement: where the object stands; drawn at random with `seed` if left out.
+        seed: of the placement.
+        task, robot, backend: in place of those that the skill notes.
+        device: where the policy runs.
+        watch: called at the start and after each step with what is observed, the number of steps
+            done and whether the goal is reached.
+
+    Raises:
+        MissingFile, BrokenFile, Mismatch: the skill can't be read.
+        UnknownName: task, robot or backend can't be found.
+    """
+    check_names(task=task, robot=robot, backend=backend)
+    from sart_toolkit.evaluate.rollout import run_rollout
+    from sart_toolkit.learn.skill import load_skill
+    from sart_toolkit.robots.model import RobotModel
+
+    loaded = load_skill(Path(skill), device)
+    about = loaded.config
+    goal = task_of(about, task)
+    placement = placement or goal.sample_placement(np.random.default_rng(seed))
+    rates = loaded.demonstration.rates
+    make = backend_maker(about, _image_size_of_skill(about), rates, goal, robot, backend)
+    with closing(make()) as made:
+        model = RobotModel(made.robot, made.scene.held)
+        return run_rollout(loaded, goal, made, model, placement, (seed, 0), watch)

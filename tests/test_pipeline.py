@@ -1,0 +1,206 @@
+"""What is not ours, named from another folder, goes through every verb and the Python API."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+import sart_toolkit as sart
+from sart_toolkit import pipeline
+from sart_toolkit.cli import main
+from sart_toolkit.data.storage import load_demonstration, read_json
+from sart_toolkit.errors import InvalidInput, Mismatch, MissingFile, UnknownName
+
+MINE = """
+import dataclasses
+import sart_toolkit as sart
+from sart_toolkit.backends.pybullet import PyBulletBackend
+from sart_toolkit.learn.policies.compact_mlp import CompactEncoder
+from sart_toolkit.tasks.peg_in_hole import PegInHole
+
+ROBOT = dataclasses.replace(sart.get_robot("ur5e_2f85"), name="mine")
+
+
+class Drawer(PegInHole):
+    name = "drawer"
+    robot = "my_things.py:ROBOT"
+
+
+class Simulator(PyBulletBackend):
+    name = "simulator"
+
+
+def inside(demonstration, sphere, rng, config):
+    t_star = sart.convergence_waypoint(demonstration, sphere)
+    return sart.Proposal(t_star, sart.sample_pose(sphere, rng, config))
+
+
+INSIDE = sart.Strategy(inside)
+
+
+class Encoder(CompactEncoder):
+    pass
+
+
+def operator(setup):
+    return sart.ScriptedOperator(setup.task.plan(setup.state), setup.rng)
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with things of one's own, and what the verbs up to `train` made of them there."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    (folder / "my_things.py").write_text(MINE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "path", list(sys.path))
+        for command in (
+            "record my_things.py:Drawer --backend my_things.py:Simulator --image-size 32 "
+            "--device my_things.py:operator --out demo.h5",
+            "suggest demo.h5 --out spheres.json",
+            "augment demo.h5 spheres.json --out data --n 4 --workers 2 "
+            "--strategy my_things.py:INSIDE",
+            "train data --out skill --policy my_things.py:Encoder --epochs 1 --device cpu",
+        ):
+            main([*command.split(), "--json"])
+    return folder
+
+
+@pytest.fixture
+def there(made, monkeypatch):
+    monkeypatch.chdir(made)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return made
+
+
+def said(capsys, *argv):
+    capsys.readouterr()
+    main([*map(str, argv), "--json"])
+    return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+
+
+def refused(capsys, *argv):
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        main([str(word) for word in argv])
+    assert exit_.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line
+
+
+NOTED = {
+    "task": "my_things.py:Drawer",
+    "robot": "my_things.py:ROBOT",
+    "backend": "my_things.py:Simulator",
+}
+
+
+def test_each_file_notes_what_it_was_made_with(there):
+    assert load_demonstration(there / "demo.h5").references == NOTED
+    assert load_demonstration(there / "data" / "demo.h5").references == NOTED
+    info = read_json(there / "data" / "dataset.json")
+    assert info["references"] == NOTED
+    assert info["config"]["strategy"] == "my_things.py:INSIDE"
+    config = read_json(there / "skill" / "config.json")
+    assert config["references"] == NOTED
+    assert config["training"]["policy"] == "my_things.py:Encoder"
+
+
+def test_later_verbs_find_it_again(there, tmp_path, capsys):
+    assert said(capsys, "validate", "data")["episodes"] == 3
+    result = said(
+        capsys, "evaluate", "skill", "--out", tmp_path / "e.json", "--episodes", 2,
+        "--workers", 2, "--videos", 0,
+    )  # fmt: skip
+    assert (result["task"], result["backend"]) == ("drawer", "simulator")
+    argv = ["annotate", "demo.h5", "--suggest-all", "--no-window", "--out", tmp_path / "a.json"]
+    assert said(capsys, *argv)["saved"]
+    film = ["play", "demo.h5", "--out", tmp_path / "film.mp4", "--speed", 4]
+    assert said(capsys, *film)["kind"] == "demonstration"
+    again = "augment demo.h5 spheres.json --out data --n 4 --strategy my_things.py:INSIDE"
+    assert said(capsys, *again.split())["n_kept"] == 3
+
+
+def test_elsewhere_it_says_what_is_missing_and_takes_another(there, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    argv = ["suggest", there / "demo.h5", "--out", tmp_path / "a.json"]
+    line = refused(capsys, *argv)
+    assert "robot 'my_things.py:ROBOT': no file my_things.py from" in line
+    assert "it is what the recording notes: name another with --robot REF" in line
+    mine = there / "my_things.py"
+    argv += ["--robot", f"{mine}:ROBOT"]
+    assert "name another with --task REF" in refused(capsys, *argv)
+    assert said(capsys, *argv, "--task", f"{mine}:Drawer")["spheres"]
+    line = refused(capsys, "evaluate", there / "skill", "--out", tmp_path / "e.json")
+    assert "policy 'my_things.py:Encoder': no file my_things.py from" in line
+
+
+def test_what_is_given_in_place_of_the_noted_is_noted_from_then_on(there, tmp_path, capsys):
+    argv = "augment demo.h5 spheres.json --n 2 --task peg_in_hole --out"
+    said(capsys, *argv.split(), tmp_path / "data")
+    noted = load_demonstration(tmp_path / "data" / "demo.h5").references
+    assert noted == {**NOTED, "task": "peg_in_hole"}
+
+
+def test_a_skill_runs_on_what_it_notes_or_on_what_is_given(there):
+    rollout = sart.run_skill("skill", seed=3)
+    assert rollout == sart.run_skill(Path("skill"), seed=3, backend="pybullet")
+    steps = []
+    placed = sart.Placement(0.01, 0.0)
+    seen = sart.run_skill(
+        "skill", placement=placed, robot="ur5e_2f85", task="peg_in_hole",
+        watch=lambda picture, step, success: steps.append(step),
+    )  # fmt: skip
+    assert seen.placement == placed and len(steps) == seen.steps + 1
+    with pytest.raises(MissingFile, match="no such skill directory"):
+        sart.run_skill("nowhere")
+
+
+def test_a_whole_run_takes_objects_and_resumes(there, tmp_path, caplog):
+    mine = sart.get_task("my_things.py:Drawer")
+    given = {
+        "robot": sart.get_robot("my_things.py:ROBOT"),
+        "backend": sart.get_backend("my_things.py:Simulator"),
+        "n": 3, "episodes": 1, "epochs": 1, "image_size": 32, "device": "cpu",
+    }  # fmt: skip
+    heard = set()
+    caplog.set_level("INFO", "sart_toolkit.pipeline")
+    result = sart.run(mine, tmp_path / "run", **given, progress=lambda stage, *_: heard.add(stage))
+    assert heard == {"record", "suggest", "augment", "train", "evaluate"}
+    assert result["task"] == "drawer" and result["kept"] == 2
+    config = read_json(tmp_path / "run" / "run.json")["config"]
+    assert {kind: config[kind] for kind in NOTED} == NOTED
+    (tmp_path / "run" / "evaluation.json").unlink()
+    caplog.clear()
+    # The same, told by reference.
+    given |= {"robot": "my_things.py:ROBOT", "backend": "my_things.py:Simulator"}
+    sart.run("my_things.py:Drawer", tmp_path / "run", **given)
+    assert [record.message.split()[0] for record in caplog.records] == [
+        "record", "suggest", "augment", "train", "evaluate",
+    ]  # fmt: skip
+    assert sum("done before" in record.message for record in caplog.records) == 4
+    with pytest.raises(Mismatch, match="holds a run with another n;"):
+        sart.run("my_things.py:Drawer", tmp_path / "run", **given | {"n": 4})
+
+
+def test_what_cannot_work_is_said_before_anything_is_written(there, tmp_path):
+    out = tmp_path / "x"
+    for options, error, message in (
+        ({"policy": "compact"}, UnknownName, "did you mean 'compact_mlp'"),
+        ({"backend": "my_things.py:Drawer"}, UnknownName, "expected a subclass of Backend"),
+        ({"image_size": 8}, InvalidInput, "image_size: expected at least 16 pixels, got 8"),
+        ({"n": 1}, InvalidInput, "n: expected at least 2"),
+        ({"episodes": 0}, InvalidInput, "episodes: expected at least 1"),
+        ({"law": "arae"}, UnknownName, "did you mean 'area'"),
+    ):
+        with pytest.raises(error, match=message):
+            sart.run("peg_in_hole", out, **options)
+    with pytest.raises(InvalidInput, match="device 'keyboard': is for a person's hands"):
+        pipeline.record("peg_in_hole", out, device="keyboard")
+    with pytest.raises(MissingFile, match="pass one that `sart run` wrote"):
+        pipeline.report(out)
+    assert not out.exists()
