@@ -394,7 +394,8 @@ class _Threat:
     @staticmethod
     def of(placed: PlacedModel, pair: int, distance: float, q: Array) -> _Threat:
         # The tool's motion is J dq.
-        slope = np.linalg.solve(placed.kinematics.jacobian(q).T, placed.gradient(q, pair))
+        J = placed.kinematics.jacobian(q)
+        slope = np.linalg.lstsq(J.T, placed.gradient(q, pair), rcond=None)[0]
         return _Threat(placed.names(pair), pair, distance, np.asarray(slope, dtype=np.float64))
 
 
