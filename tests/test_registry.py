@@ -17,7 +17,7 @@ from sart_toolkit.augment.strategies import SART, Strategy
 from sart_toolkit.backends import BACKENDS, get_backend, make_backend
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
-from sart_toolkit.learn.policies import POLICIES, get_encoder
+from sart_toolkit.learn.policies import POLICIES, get_policy
 from sart_toolkit.learn.training import TrainConfig
 from sart_toolkit.record.devices import DEVICES, make_device
 from sart_toolkit.registry import check_known, lasting_reference, reference_to, resolve
@@ -28,8 +28,8 @@ from sart_toolkit.tasks.peg_in_hole import PegInHole
 MINE = """
 import dataclasses
 from sart_toolkit.backends.pybullet import PyBulletBackend
-from sart_toolkit.learn.policies.compact_mlp import CompactEncoder
-from sart_toolkit.augment.strategies import Strategy, sart
+from sart_toolkit.learn.policies.compact_mlp import CompactMLP
+from sart_toolkit.augment.strategies import Sart
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks.peg_in_hole import PegInHole
 
@@ -46,10 +46,10 @@ PANDA = dataclasses.replace(get_robot("ur5e_2f85"), name="panda")
 class Mine(PyBulletBackend):
     name = "mine"
 
-class MyEncoder(CompactEncoder):
+class MyPolicy(CompactMLP):
     pass
 
-INSIDE = Strategy(sart)
+INSIDE = Sart()
 NUMBER = 3
 """
 
@@ -74,7 +74,7 @@ LOOKUPS: dict[str, tuple[Callable[[str], object], str]] = {
     "task": (get_task, "Drawer"),
     "backend": (get_backend, "Mine"),
     "strategy": (get_strategy, "INSIDE"),
-    "policy": (get_encoder, "MyEncoder"),
+    "policy": (get_policy, "MyPolicy"),
 }
 TABLES = {
     "robot": ROBOTS,
@@ -127,8 +127,8 @@ def test_what_is_inside_a_function_has_no_reference():
 def test_configurations_keep_the_reference_of_an_object(folder):
     assert AugmentConfig(strategy=get_strategy("mine.py:INSIDE")).strategy == "mine.py:INSIDE"
     assert AugmentConfig(strategy=SART).strategy == "sart"
-    config = TrainConfig.for_policy(get_encoder("mine.py:MyEncoder"))
-    assert config.policy == "mine.py:MyEncoder"
+    config = TrainConfig.for_policy(get_policy("mine.py:MyPolicy"))
+    assert config.policy == "mine.py:MyPolicy"
     assert TrainConfig.from_json(config.to_json()) == config
 
 
@@ -173,8 +173,8 @@ def test_what_is_of_another_kind_is_refused(folder):
         get_robot("mine.py:Drawer")
     with pytest.raises(UnknownName, match="backend 'mine.py:Drawer': expected a subclass of Back"):
         get_backend("mine.py:Drawer")
-    with pytest.raises(UnknownName, match="policy: expected a subclass of Encoder, got int"):
-        get_encoder(3)
+    with pytest.raises(UnknownName, match="policy: expected a subclass of Policy, got int"):
+        get_policy(3)
     with pytest.raises(UnknownName, match="strategy: expected a Strategy, got the class"):
         get_strategy(PegInHole)
     with pytest.raises(UnknownName, match="device 'mine.py:NUMBER': expected a Device, got int"):
@@ -200,14 +200,14 @@ def test_an_installed_entry_point_is_found_and_named_again(folder, monkeypatch):
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: robots_of_mine\nVersion: 1\n")
     (about / "entry_points.txt").write_text(
         f"[sart_toolkit.robots]\nmy_panda = {module_of(folder)}:PANDA\n"
-        f"[sart_toolkit.policies]\nmy_policy = {module_of(folder)}:MyEncoder\n"
+        f"[sart_toolkit.policies]\nmy_policy = {module_of(folder)}:MyPolicy\n"
     )
     monkeypatch.syspath_prepend(folder / "site")
     monkeypatch.syspath_prepend(folder)
     check_known("robot", "my_panda", ROBOTS)
     assert get_robot("my_panda").name == "panda"
     assert reference_to("robot", get_robot("my_panda"), ROBOTS) == "my_panda"
-    assert get_encoder("my_policy").__name__ == "MyEncoder"
+    assert get_policy("my_policy").__name__ == "MyPolicy"
     with pytest.raises(UnknownName, match="did you mean 'my_panda'.*ur5e_2f85"):
         get_robot("my_pandas")
 

@@ -347,7 +347,8 @@ class _UnprovenPair:
     @staticmethod
     def of(placed: PlacedModel, pair: int, distance: float, q: Array) -> _UnprovenPair:
         # The tool's motion is J dq.
-        slope = np.linalg.solve(placed.kinematics.jacobian(q).T, placed.gradient(q, pair))
+        J = placed.kinematics.jacobian(q)
+        slope = np.linalg.lstsq(J.T, placed.gradient(q, pair), rcond=None)[0]
         return _UnprovenPair(
             placed.names(pair), pair, distance, np.asarray(slope, dtype=np.float64)
         )

@@ -51,7 +51,7 @@ def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
         MissingExtra, MissingFile: a source URDF isn't there.
         BrokenFile: a source URDF can't be parsed.
         InvalidInput: two links or joints have the same name, a link is drawn but has no collision
-            shape, or a collision mesh isn't that of a solid.
+            shape, or a collision mesh is empty or not finite.
     """
     sources = [resource_path(spec.urdf), resource_path(spec.gripper.urdf)]
     attachments = [*spec.attachments, *held]
@@ -220,7 +220,7 @@ def _lighten(link: ET.Element, base: Path, work: Path, spec: RobotSpec) -> None:
                 continue
             loaded = _loaded(mesh, base)
             if kind == "collision":
-                _check_solid(loaded, name, mesh.get("filename", ""))
+                _check_mesh(loaded, name, mesh.get("filename", ""))
                 light = loaded.convex_hull
             else:
                 light = _simplified(loaded, target, solids.get(_where(element)))
@@ -255,28 +255,17 @@ def _loaded(element: ET.Element, base: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _check_solid(mesh: trimesh.Trimesh, link: str, file: str) -> None:
-    """Return if a collision mesh bounds a solid, whose convex hull then encloses the link.
+def _check_mesh(mesh: trimesh.Trimesh, link: str, file: str) -> None:
+    """Return if a collision mesh has a convex hull; holes and flat triangles do it no harm.
 
     Raises:
-        InvalidInput: it has no faces, numbers that aren't finite, triangles without area, or holes.
+        InvalidInput: it has no faces, or numbers that aren't finite.
     """
     what = f"link {link!r}: collision mesh {Path(file).name}"
     if not len(mesh.faces):
         raise InvalidInput(f"{what} has no triangles; export it again")
     if not np.isfinite(mesh.vertices).all():
         raise InvalidInput(f"{what} has NaN or infinite vertices; export it again")
-    flat = int((~mesh.nondegenerate_faces()).sum())
-    if flat:
-        raise InvalidInput(
-            f"{what} has {flat} degenerate triangles (no area); remove them, for instance with "
-            "trimesh's update_faces(nondegenerate_faces())"
-        )
-    if not mesh.is_watertight:
-        raise InvalidInput(
-            f"{what} isn't watertight, so a part of the link may be missing; close its holes, or "
-            "use boxes, cylinders and spheres"
-        )
 
 
 def _simplified(

@@ -27,7 +27,7 @@ def test_first_skill_on_a_small_budget_and_running_it(tmp_path: Path) -> None:
 
 
 def test_a_backend_of_one_s_own_moves_the_tool() -> None:
-    assert "the tool is at" in run("03_own_backend.py")
+    assert "the tool is at" in run("07_own_backend.py")
 
 
 def test_examples_are_short() -> None:

@@ -55,7 +55,7 @@ def test_a_backend_with_some_abilities_or_none_keeps_the_rest_of_the_contract(
     run_suite, name, lacking
 ):
     """The example of one's own backend, and the bare core that it is built on."""
-    name = f"03_own_backend:{name}"
+    name = f"07_own_backend:{name}"
     outcome = run_suite([name], "ur5e_2f85")[name]
     assert not outcome.failed, _told(outcome)
     assert outcome.passed >= 24

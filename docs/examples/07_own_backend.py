@@ -1,6 +1,6 @@
 """A backend of one's own: an arm that is wherever it was told to be, and a scene around it.
 
-Test: pytest --pyargs sart_toolkit.testing --sart-backend 03_own_backend:KinematicBackend
+Test: pytest --pyargs sart_toolkit.testing --sart-backend 07_own_backend:KinematicBackend
 """
 
 import numpy as np
