@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,31 +67,34 @@ def mass_properties(shapes: Sequence[Shape], mass: float) -> tuple[Array, Array]
     The mass [kg] is spread evenly over the volume of the shapes that collide, or of all shapes
     where none does; where two overlap both count.
     """
-    # A robot as data doesn't need Pinocchio.
-    import pinocchio as pin
-
+    # Pinocchio's inertias need a mass for each shape, so volumes all the same, and a robot as data
+    # doesn't need Pinocchio.
     solid = [shape for shape in shapes if shape.collides] or list(shapes)
-    volumes = np.array([_volume(shape) for shape in solid])
-    make = {
-        "box": pin.Inertia.FromBox,
-        "cylinder": pin.Inertia.FromCylinder,
-        "sphere": pin.Inertia.FromSphere,
-    }
-    parts = [
-        pin.SE3(shape.T_body_shape).act(make[shape.kind](float(m), *shape.size))
-        for shape, m in zip(solid, mass * volumes / volumes.sum(), strict=True)
-    ]
-    whole = functools.reduce(operator.add, parts)
-    return np.array(whole.lever), np.array(whole.inertia)
+    volumes, moments = zip(*(_volume_and_moments(shape) for shape in solid), strict=True)
+    masses = mass * np.array(volumes) / sum(volumes)
+    p = np.stack([shape.T_body_shape[:3, 3] for shape in solid])
+    centre = masses @ p / mass
+    inertia = np.zeros((3, 3))
+    for m, moment, shape, offset in zip(masses, moments, solid, p - centre, strict=True):
+        R = shape.T_body_shape[:3, :3]
+        # Steiner's theorem.
+        inertia += m * (
+            R @ np.diag(moment) @ R.T + offset @ offset * np.eye(3) - np.outer(offset, offset)
+        )
+    return centre, inertia
 
 
-def _volume(shape: Shape) -> float:
-    """The volume [m³] of a shape; Pinocchio makes inertias from a mass."""
+def _volume_and_moments(shape: Shape) -> tuple[float, Array]:
+    """The volume [m³] and the principal moments `(3,)` per mass [m²] about the shape's centre."""
     if shape.kind == "box":
-        return float(np.prod(shape.size))
+        square = np.square(shape.size)
+        return float(np.prod(shape.size)), (square.sum() - square) / 12
+    r = shape.size[0]
     if shape.kind == "sphere":
-        return 4 / 3 * np.pi * shape.size[0] ** 3
-    return np.pi * shape.size[0] ** 2 * shape.size[1]
+        return 4 / 3 * np.pi * r**3, np.full(3, 0.4 * r**2)
+    length = shape.size[1]
+    across = r**2 / 4 + length**2 / 12
+    return np.pi * r**2 * length, np.array([across, across, r**2 / 2])
 
 
 @dataclass(frozen=True)
