@@ -99,6 +99,8 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
         c.setTimeStep(1.0 / rates.physics_hz)
         c.setGravity(*scene.gravity)
         c.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
+        # Bullet would keep every file that it ever read, each restored state among them.
+        c.setPhysicsEngineParameter(enableFileCaching=0)
         self._load_robot()
         # Where each body is: its multibody, and its link there (-1: the base).
         self._bodies: dict[str, tuple[int, int]] = {}
