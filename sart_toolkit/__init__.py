@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         SensesForce,
         require,
     )
+    from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
     from sart_toolkit.collision.certificate import Certificate, certify
     from sart_toolkit.collision.cloud import CloudConfig
     from sart_toolkit.collision.cloud_world import CloudWorld
@@ -104,6 +105,8 @@ if TYPE_CHECKING:
         GripperSpec,
         RobotSpec,
         Shape,
+        check_gripper,
+        check_image_size,
         look_at,
     )
     from sart_toolkit.scenes.appearance import AppearanceConfig, vary_appearance
@@ -150,6 +153,11 @@ _HOMES = {
         "SensesContacts",
         "SensesForce",
         "require",
+    ),
+    "backends.states": (
+        "pack_state",
+        "scene_digest",
+        "unpack_state",
     ),
     "collision.certificate": (
         "Certificate",
@@ -264,6 +272,8 @@ _HOMES = {
         "GripperSpec",
         "RobotSpec",
         "Shape",
+        "check_gripper",
+        "check_image_size",
         "look_at",
     ),
     "scenes.appearance": (

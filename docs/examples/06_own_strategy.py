@@ -27,9 +27,7 @@ INSIDE = Inside()
 
 
 def main(out: Path, n: int = 40, epochs: int = 60, rollouts: int = 20) -> None:
-    result = sart.run(
-        "peg_in_hole", out, strategy=INSIDE, n=n, epochs=epochs, episodes=rollouts
-    )
+    result = sart.run("peg_in_hole", out, strategy=INSIDE, n=n, epochs=epochs, episodes=rollouts)
     print(f"{result['success']} succeeded; the page: {result['report']}")
 
 

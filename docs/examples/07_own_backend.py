@@ -1,42 +1,49 @@
-"""A backend of one's own: an arm that is wherever it was told to be, and a scene around it.
+"""A backend of one's own: an arm that is wherever it was commanded to be, drawn by PyBullet.
 
-Test: pytest --pyargs sart_toolkit.testing --sart-backend 07_own_backend:KinematicBackend
+In Python: python docs/examples/07_own_backend.py OUT_DIR [N_TRAJECTORIES EPOCHS ROLLOUTS]
+By verbs:  sart run peg_in_hole --backend docs/examples/07_own_backend.py:Kinematic --out OUT_DIR
+Test:      pytest --pyargs sart_toolkit.testing --sart-backend 07_own_backend:Kinematic
 """
+
+import sys
+from pathlib import Path
 
 import numpy as np
 
 import sart_toolkit as sart
-from sart_toolkit.backends import interface as api
-from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
-from sart_toolkit.robots.spec import check_gripper
 
 
-class KinematicArm(api.Backend):
-    """The core, as a hardware arm has it: observe, command, step, close."""
+class Kinematic(sart.Backend, sart.Resets, sart.SavesStates, sart.KnowsBodies, sart.Draws):
+    """No physics: bodies stay where a reset puts them."""
 
-    name, no_pictures = "kinematic", "it has no cameras"
+    name = "kinematic"
 
     def __init__(self, robot, scene, *options):
         super().__init__(robot, scene, *options)
         self.model = sart.RobotModel(robot, scene.held)
-        self.digest = scene_digest(self.model, scene)
-        self.place(robot.home, 0.0, 0.0)
+        self.eye = sart.make_backend("pybullet", robot, scene)
+        self.of = robot.name, sart.scene_digest(self.model, scene), [b.name for b in scene.bodies]
+        self.reset(scene.initial_state(robot.home, 0.0))
 
-    def place(self, q, gripper, gripper_target):
-        q = self.model.check_limits(q).tolist()
-        self.now = {"q": q, "dq": [0.0] * len(q), "gripper": gripper, "periods": 0}
-        self.now["target"] = [q, gripper_target]
+    def reset(self, state):
+        self.scene.check_state(state)
+        q = self.model.check_limits(state.q).tolist()
+        bodies = {name: T.tolist() for name, T in state.Ts_world_body.items()}
+        self.now = {"q": q, "dq": [0.0] * len(q), "gripper": state.gripper, "periods": 0}
+        self.now |= {"bodies": bodies, "target": [q, state.commanded_gripper]}
 
     def observe(self, cameras=(), image_size=None):
         self.check_cameras(cameras)
         q, dq, gripper = (np.array(self.now[name]) for name in ("q", "dq", "gripper"))
-        time = self.now["periods"] / self.rates.control_hz
-        bodies = self.body_poses() if isinstance(self, api.KnowsBodies) else {}
-        return api.Observation(q, dq, float(gripper), self.model.fk(q), time, {}, bodies)
+        time, Ts = self.now["periods"] / self.rates.control_hz, self.body_poses()
+        state = self.scene.seen_state(q, gripper, Ts)
+        size = sart.check_image_size(self.image_size if image_size is None else image_size)
+        views = {name: self.draw(state, self.cameras[name], *size) for name in cameras}
+        return sart.Observation(q, dq, float(gripper), self.model.fk(q), time, views, Ts)
 
     def command(self, q, gripper):
-        self.now["target"] = [self.model.check_limits(q).tolist(), check_gripper(gripper)]
-        return api.CommandSent(q, gripper)
+        self.now["target"] = [self.model.check_limits(q).tolist(), sart.check_gripper(gripper)]
+        return sart.CommandSent(q, gripper)
 
     def step(self):
         (q, gripper), was, hz = self.now["target"], self.now["gripper"], self.rates.control_hz
@@ -45,34 +52,27 @@ class KinematicArm(api.Backend):
         self.now |= {"q": q, "gripper": was + float(np.clip(gripper - was, -reach, reach))}
         self.now["periods"] += 1
 
-    def close(self):
-        pass
-
-
-class KinematicBackend(KinematicArm, api.Resets, api.SavesStates, api.KnowsBodies):
-    """Three abilities more; bodies stay where a reset puts them."""
-
-    def reset(self, state):
-        self.scene.check_state(state)
-        self.place(state.q, state.gripper, state.commanded_gripper)
-        self.now["bodies"] = {name: T.tolist() for name, T in state.Ts_world_body.items()}
-
     def body_poses(self):
         model = sart.RobotModel(self.robot, self.scene.held, self.now["gripper"])
         held = {body.name: model.fk(self.now["q"], body.name) for body in self.scene.held}
-        return {name: np.array(T) for name, T in self.now.get("bodies", {}).items()} | held
+        return {name: np.array(T) for name, T in self.now["bodies"].items()} | held
+
+    def draw(self, state, camera, width, height):
+        return self.eye.draw(state, camera, width, height)
 
     def save(self):
-        head = {"robot": self.robot.name, "scene": self.digest, "bodies": []}
-        return pack_state(self.name, head | {"now": self.now}, b"")
+        head = dict(zip(("robot", "scene", "bodies"), self.of, strict=True)) | {"now": self.now}
+        return sart.pack_state(self.name, head, b"")
 
     def restore(self, state):
-        head, _ = unpack_state(self.name, state, self.robot.name, self.digest, [])
-        self.now = head["now"]
+        self.now = sart.unpack_state(self.name, state, *self.of)[0]["now"]
+
+    def close(self):
+        self.eye.close()
 
 
 if __name__ == "__main__":
-    arm = KinematicArm(sart.get_robot("ur5e_2f85"), sart.get_task("peg_in_hole").scene)
-    arm.command(arm.observe().q + 0.01, 1.0)
-    arm.step()
-    print("the tool is at", arm.observe().T_world_tool[:3, 3].round(3), "m")
+    n, epochs, rollouts = map(int, sys.argv[2:] or (40, 60, 20))
+    options = {"n": n, "epochs": epochs, "episodes": rollouts}
+    result = sart.run("peg_in_hole", Path(sys.argv[1]), backend=Kinematic, **options)
+    print(f"{result['success']} succeeded; the page: {result['report']}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -26,10 +27,8 @@ def test_first_skill_on_a_small_budget_and_running_it(tmp_path: Path) -> None:
     assert "succeeded" in said or "failed: " in said
 
 
-def test_a_backend_of_one_s_own_moves_the_tool() -> None:
-    assert "the tool is at" in run("07_own_backend.py")
-
-
-def test_examples_are_short() -> None:
+def test_examples_are_short_and_import_what_is_public() -> None:
     for path in EXAMPLES.glob("*.py"):
-        assert len(path.read_text().splitlines()) < 80, path.name
+        text = path.read_text()
+        assert len(text.splitlines()) <= 80, path.name
+        assert not re.search(r"sart_toolkit[.\w]*[. ]_\w|from sart_toolkit\.", text), path.name

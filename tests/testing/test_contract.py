@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -11,7 +12,8 @@ from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import ROBOTS, get_robot
 from sart_toolkit.scenes.spec import SceneSpec
 
-NO_PICTURES = "pictures: it has no cameras"
+HERE = Path(__file__).parent
+EXAMPLES = HERE.parents[1] / "docs" / "examples"
 
 
 def _told(outcome):
@@ -38,9 +40,9 @@ def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
 @pytest.mark.parametrize(
     ("name", "lacking"),
     [
-        ("KinematicBackend", {"SensesContacts", NO_PICTURES}),
+        (EXAMPLES / "07_own_backend.py:Kinematic", {"SensesContacts"}),
         (
-            "KinematicArm",
+            HERE / "core_only.py:CoreOnly",
             {
                 "Resets",
                 "SavesStates",
@@ -54,8 +56,8 @@ def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
 def test_a_backend_with_some_abilities_or_none_keeps_the_rest_of_the_contract(
     run_suite, name, lacking
 ):
-    """The example of one's own backend, and the bare core that it is built on."""
-    name = f"07_own_backend:{name}"
+    """The example of one's own backend, and the bare core of it."""
+    name = str(name)
     outcome = run_suite([name], "ur5e_2f85")[name]
     assert not outcome.failed, _told(outcome)
     assert outcome.passed >= 24
