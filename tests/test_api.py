@@ -51,4 +51,4 @@ def test_records_with_arrays_have_a_short_repr(peg_demonstration, peg_annotation
         assert len(repr(record)) < 300 and "\n" not in repr(record)
     assert repr(peg_demonstration).startswith("Demonstration(task=peg_in_hole, robot=ur5e_2f85")
     assert f"waypoints={len(peg_demonstration)}" in repr(peg_demonstration)
-    assert repr(peg_dataset.episodes[0]).startswith("Episode(steps=")
+    assert repr(peg_dataset.episode(0)).startswith("Episode(steps=")

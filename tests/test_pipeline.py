@@ -18,7 +18,7 @@ MINE = """
 import dataclasses
 import sart_toolkit as sart
 from sart_toolkit.backends.pybullet import PyBulletBackend
-from sart_toolkit.learn.policies.compact_mlp import CompactEncoder
+from sart_toolkit.learn.policies.compact_mlp import CompactMLP
 from sart_toolkit.tasks.peg_in_hole import PegInHole
 
 ROBOT = dataclasses.replace(sart.get_robot("ur5e_2f85"), name="mine")
@@ -33,15 +33,16 @@ class Simulator(PyBulletBackend):
     name = "simulator"
 
 
-def inside(demonstration, sphere, rng, config):
-    t_star = sart.convergence_waypoint(demonstration, sphere)
-    return sart.Proposal(t_star, sart.sample_pose(sphere, rng, config))
+class Inside(sart.Strategy):
+    def propose(self, demonstration, sphere, rng, config):
+        t_star = sart.convergence_waypoint(demonstration, sphere)
+        return sart.Proposal(t_star, sart.sample_pose(sphere, rng, config))
 
 
-INSIDE = sart.Strategy(inside)
+INSIDE = Inside()
 
 
-class Encoder(CompactEncoder):
+class MyPolicy(CompactMLP):
     pass
 
 
@@ -64,7 +65,7 @@ def made(tmp_path_factory):
             "suggest demo.h5 --out spheres.json",
             "augment demo.h5 spheres.json --out data --n 4 --workers 2 "
             "--strategy my_things.py:INSIDE",
-            "train data --out skill --policy my_things.py:Encoder --epochs 1 --device cpu",
+            "train data --out skill --policy my_things.py:MyPolicy --epochs 1 --device cpu",
         ):
             main([*command.split(), "--json"])
     return folder
@@ -101,13 +102,13 @@ NOTED = {
 
 def test_each_file_notes_what_it_was_made_with(there):
     assert load_demonstration(there / "demo.h5").references == NOTED
-    assert load_demonstration(there / "data" / "demo.h5").references == NOTED
+    assert load_demonstration(there / "data" / "sources" / "demo00" / "demo.h5").references == NOTED
     info = read_json(there / "data" / "dataset.json")
     assert info["references"] == NOTED
     assert info["config"]["strategy"] == "my_things.py:INSIDE"
     config = read_json(there / "skill" / "config.json")
     assert config["references"] == NOTED
-    assert config["training"]["policy"] == "my_things.py:Encoder"
+    assert config["training"]["policy"] == "my_things.py:MyPolicy"
 
 
 def test_later_verbs_find_it_again(there, tmp_path, capsys):
@@ -136,13 +137,13 @@ def test_elsewhere_it_says_what_is_missing_and_takes_another(there, tmp_path, mo
     assert "name another with --task REF" in refused(capsys, *argv)
     assert said(capsys, *argv, "--task", f"{mine}:Drawer")["spheres"]
     line = refused(capsys, "evaluate", there / "skill", "--out", tmp_path / "e.json")
-    assert "policy 'my_things.py:Encoder': no file my_things.py from" in line
+    assert "policy 'my_things.py:MyPolicy': no file my_things.py from" in line
 
 
 def test_what_is_given_in_place_of_the_noted_is_noted_from_then_on(there, tmp_path, capsys):
     argv = "augment demo.h5 spheres.json --n 2 --task peg_in_hole --out"
     said(capsys, *argv.split(), tmp_path / "data")
-    noted = load_demonstration(tmp_path / "data" / "demo.h5").references
+    noted = load_demonstration(tmp_path / "data" / "sources" / "demo00" / "demo.h5").references
     assert noted == {**NOTED, "task": "peg_in_hole"}
 
 
@@ -170,7 +171,7 @@ def test_a_whole_run_takes_objects_and_resumes(there, tmp_path, caplog):
     heard = set()
     caplog.set_level("INFO", "sart_toolkit.pipeline")
     result = sart.run(mine, tmp_path / "run", **given, progress=lambda stage, *_: heard.add(stage))
-    assert heard == {"record", "suggest", "augment", "train", "evaluate"}
+    assert heard == {"record", "suggest", "augment", "read", "train", "evaluate"}
     assert result["task"] == "drawer" and result["kept"] == 2
     config = read_json(tmp_path / "run" / "run.json")["config"]
     assert {kind: config[kind] for kind in NOTED} == NOTED
@@ -195,7 +196,7 @@ def test_what_cannot_work_is_said_before_anything_is_written(there, tmp_path):
         ({"image_size": 8}, InvalidInput, "image_size: expected at least 16 pixels, got 8"),
         ({"n": 1}, InvalidInput, "n: expected at least 2"),
         ({"episodes": 0}, InvalidInput, "episodes: expected at least 1"),
-        ({"law": "arae"}, UnknownName, "did you mean 'area'"),
+        ({"distribution": "arae"}, UnknownName, "did you mean 'area'"),
     ):
         with pytest.raises(error, match=message):
             sart.run("peg_in_hole", out, **options)

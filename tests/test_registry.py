@@ -13,7 +13,7 @@ import pytest
 from sart_toolkit import registry
 from sart_toolkit.augment import STRATEGIES, get_strategy
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.strategies import SART, Strategy
+from sart_toolkit.augment.strategies import SART, Sart
 from sart_toolkit.backends import BACKENDS, get_backend, make_backend
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
@@ -117,11 +117,14 @@ def test_what_is_inside_a_function_has_no_reference():
     class Local(PegInHole):
         pass
 
+    class LocalStrategy(Sart):
+        pass
+
     assert reference_to("task", Local(), TASKS) is None
-    with pytest.raises(InvalidInput, match="strategy: no file could name this Strategy"):
-        lasting_reference("strategy", Strategy(lambda *_: None), STRATEGIES)
+    with pytest.raises(InvalidInput, match="strategy: no file could name this LocalStrategy"):
+        lasting_reference("strategy", LocalStrategy(), STRATEGIES)
     with pytest.raises(InvalidInput, match="no file could name"):
-        AugmentConfig(strategy=Strategy(lambda *_: None))
+        AugmentConfig(strategy=LocalStrategy())
 
 
 def test_configurations_keep_the_reference_of_an_object(folder):

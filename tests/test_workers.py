@@ -7,7 +7,6 @@ import os
 import pytest
 
 from sart_toolkit.errors import InvalidInput, SartError
-from sart_toolkit.registry import lookup
 from sart_toolkit.workers import worker_map
 
 
@@ -59,10 +58,3 @@ def test_a_process_that_dies_is_one_error_with_a_remedy() -> None:
         worker_map(Deserter, 2) as run,
     ):
         list(run(range(3)))
-
-
-def test_tables_are_looked_up_lazily_and_offer_the_nearest_name() -> None:
-    table = {"join": "os.path:join"}
-    assert lookup("function", "join", table) is os.path.join
-    with pytest.raises(LookupError, match="unknown function 'jion': did you mean 'join'"):
-        lookup("function", "jion", table)

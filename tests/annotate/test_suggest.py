@@ -15,7 +15,7 @@ from sart_toolkit.annotate.suggest import (
     suggest_annotation,
     suggest_radius,
 )
-from sart_toolkit.augment.strategies import sart
+from sart_toolkit.augment.strategies import SART
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.records import convergence_waypoint
 from sart_toolkit.data.sampling import SamplingConfig
@@ -174,7 +174,7 @@ def test_every_pose_that_augmentation_draws_keeps_the_whole_robot_clear(
         for i in range(60):
             radius = sphere.radius * (1.0 if i % 2 else rng.uniform())
             drawn = dataclasses.replace(sphere, radius=max(radius, 1e-6))
-            T = sart(peg_demonstration, drawn, rng, SamplingConfig()).T_world_sampled
+            T = SART.propose(peg_demonstration, drawn, rng, SamplingConfig()).T_world_sampled
             distances = placed.distances(placed.kinematics.ik(T, near))
             assert distances[placed.tool_pairs()].min() >= margin - 1e-6
             assert distances.min() >= 0

@@ -35,8 +35,8 @@ def test_a_dataset_is_generated_against_the_cloud_and_validated_against_it(
     dataset, peg_model, peg_task
 ):
     generated, out = dataset
-    assert len(generated.episodes) == CONFIG.n - 1
-    proofs = [episode.provenance.certificate for episode in generated.episodes]
+    assert len(generated) == CONFIG.n - 1
+    proofs = [episode.provenance.certificate for episode in generated]
     pairs = [proof[which]["pair"] for proof in proofs for which in ("commanded", "measured")]
     assert any(CLOUD in pair for pair in pairs)
     bodies = {body.name for body in peg_task.scene.bodies}
@@ -52,11 +52,13 @@ def test_a_proof_against_the_cloud_is_no_proof_against_the_scene(dataset, peg_mo
     """What is asked for is checked: of the same draws the other world proves other clearances."""
     generated, _ = dataset
     scene = SegmentPlanner(
-        world_of(generated.demonstration, peg_model.spec, peg_task.scene, AugmentConfig()),
-        generated.annotation,
+        world_of(
+            generated.sources[0].demonstration, peg_model.spec, peg_task.scene, AugmentConfig()
+        ),
+        generated.sources[0].annotation,
         AugmentConfig(),
     )
-    episode = generated.episodes[0]
+    episode = generated.episode(0)
     _, exact = scene.plan(*scene.proposal(episode.provenance.sphere, episode.provenance.k))
     assert episode.provenance.certificate["commanded"]["pair"] != list(exact.pair)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.backends import BACKENDS, get_backend, make_backend
 from sart_toolkit.backends.interface import (
     Draws,
     Observation,
@@ -18,7 +18,7 @@ from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import MissingCapability, MissingExtra, UnknownName
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.spec import SceneSpec
-from sart_toolkit.testing.bench import find_backend, make_bench
+from sart_toolkit.testing.bench import make_bench
 
 
 def test_an_unknown_backend_is_refused_with_the_nearest_name():
@@ -29,7 +29,7 @@ def test_an_unknown_backend_is_refused_with_the_nearest_name():
 @pytest.mark.parametrize("name", BACKENDS)
 def test_a_backend_has_the_name_that_it_has_in_the_table(name):
     try:
-        assert find_backend(name).name == name
+        assert get_backend(name).name == name
     except MissingExtra as error:
         pytest.skip(str(error))
 

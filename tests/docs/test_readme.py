@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sart_toolkit.cli import main
-from sart_toolkit.data.storage import load_dataset
+from sart_toolkit.data.dataset import load_dataset
 
 ROOT = Path(__file__).parents[2]
 

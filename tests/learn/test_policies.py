@@ -226,5 +226,5 @@ def test_every_entry_of_the_table_is_a_policy():
 
 def test_what_is_no_policy_is_refused(monkeypatch):
     monkeypatch.setitem(POLICIES, "resnet", "sart_toolkit.learn.policies.resnet18_mlp:ResNet18")
-    with pytest.raises(InvalidInput, match="policy 'resnet': expected a subclass of Policy, got"):
+    with pytest.raises(UnknownName, match="policy 'resnet': expected a subclass of Policy, got"):
         get_policy("resnet")

@@ -6,16 +6,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-from sart_toolkit.collision.demonstrated import DemonstratedScene
 
-from sart_toolkit.annotate.suggest import ExactSurroundings, suggest_annotation
+from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.augment.executors import KEPT, SegmentMaker
+from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import make_backend
 from sart_toolkit.backends.interface import CommandSent, Draws, KnowsBodies, Resets, SensesForce
 from sart_toolkit.collision.cloud import CloudConfig, fuse_cloud
+from sart_toolkit.collision.exact import ExactWorld
+from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import Rates
 from sart_toolkit.data.storage import load_demonstration, save_demonstration
 from sart_toolkit.errors import InvalidInput, Mismatch, MissingCapability
@@ -113,7 +114,7 @@ def test_what_needs_an_ability_names_it_and_says_what_for(
 ):
     config = AugmentConfig(cameras=())
     with pytest.raises(MissingCapability, match="lacks the ability SavesStates, but segments"):
-        SegmentMaker(core, peg_demonstration, peg_annotation, config)
+        RestoreExecutor.check(core, [peg_demonstration], config)
     with pytest.raises(MissingCapability, match="lacks the ability Draws, but a recording"):
         SceneView(Playback("demo.h5", peg_demonstration), core, "overview")
     for backend, message in (
@@ -209,14 +210,13 @@ def test_the_block_is_where_it_is_in_a_cloud_of_any_cameras(seen_twice, peg_task
 def test_segments_are_seen_by_the_demonstration_s_cameras(seen_twice, peg_task, tmp_path):
     shown, _ = seen_twice
     robot = get_robot(peg_task.robot)
-    scene = DemonstratedScene(shown, robot, peg_task.scene)
-    annotation = suggest_annotation(shown, ExactSurroundings(scene), [4])
+    annotation = suggest_annotation(shown, ExactWorld(shown, robot, peg_task.scene), [4])
 
     def make():
         return make_backend("pybullet", robot, peg_task.scene, (64, 48))
 
     made = augment_demonstration(shown, annotation, make, tmp_path / "d", AugmentConfig(n=2))
-    for name, camera in made.episodes[0].steps.cameras.items():
+    for name, camera in made.episode(0).steps.cameras.items():
         reference = shown.steps.cameras[name]
         assert camera.rgb.shape[1:] == reference.rgb.shape[1:] and camera.frame == reference.frame
         np.testing.assert_allclose(camera.T_frame_camera, reference.T_frame_camera, atol=1e-5)
@@ -258,9 +258,10 @@ def test_a_demonstration_and_its_segments_at_other_rates(peg_task, peg_model, na
     assert 3.0 < shown.timestamps[-1] < 12.0
     save_demonstration(tmp_path / "demo.h5", shown)
     assert load_demonstration(tmp_path / "demo.h5").rates == rates
-    scene = DemonstratedScene(shown, robot, peg_task.scene)
-    annotation = suggest_annotation(shown, ExactSurroundings(scene), [4])
-    attempt = SegmentMaker(backend, shown, annotation, AugmentConfig())(0, 0)
+    annotation = suggest_annotation(shown, ExactWorld(shown, robot, peg_task.scene), [4])
+    attempt = RestoreExecutor(backend, [(shown, annotation)], AugmentConfig()).attempt(
+        AttemptKey(0, 0, 0)
+    )
     assert attempt.outcome == KEPT, attempt.detail
     # Two seconds, or as much longer as the joints need, in whole steps.
     duration = (attempt.episode.provenance.certificate or {})["duration"]

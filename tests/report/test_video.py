@@ -76,7 +76,7 @@ def test_a_rollout_s_film_shows_outside_wrist_and_outcome_at_each_moment(
 ) -> None:
     moments = [Moment(grey(96, 96, 90), grey(32, 32, 200), t / 10, t == 3) for t in range(n)]
     path = tmp_path / "videos" / "success_007.mp4"
-    film_rollout(path, moments, 7, "success")
+    film_rollout(path, moments, 10, 7, "success")
     expected = [
         caption(inset(m.overview, m.wrist), 7, m.seconds, "success", "goal reached" * m.success)
         for m in moments
