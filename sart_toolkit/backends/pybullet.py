@@ -283,7 +283,7 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
         q = self._model.check_limits(state.q)
         self.scene.check_state(state)
         if self._stage is None:
-            self._stage = type(self)(self.robot, self.scene, rates=self.rates)
+            self._stage = type(self)(self.robot, self.scene, self.image_size, self.rates)
         self._stage._place(dataclasses.replace(state, q=q))
         return self._stage._picture(camera, *check_image_size((width, height)))
 

@@ -30,13 +30,13 @@ def test_a_module_in_the_working_folder_is_found(run_pytest, tmp_path):
         "from sart_toolkit.backends.pybullet import PyBulletBackend\n"
         "class Mine(PyBulletBackend):\n    pass\n"
     )
-    words = ["--sart-backend", "mine:Mine", "--sart-robot", "ur5e_hande", "-q", "-k", "drift_is"]
+    words = ["--sart-backend", "mine:Mine", "--sart-robot", "ur5e_hande", "-q", "-k", "abilities_are_known"]
     result = run_pytest(tmp_path, *words)
     assert "1 passed" in result.stdout, result.stdout + result.stderr
 
 
 def test_by_default_all_our_backends_are_tested_with_all_robots(run_pytest, tmp_path):
-    result = run_pytest(tmp_path, "--collect-only", "-q", "-k", "drift_is")
+    result = run_pytest(tmp_path, "--collect-only", "-q", "-k", "abilities_are_known")
     found = [line for line in result.stdout.splitlines() if "::" in line]
     targets = {line.partition("[")[2].rstrip("]") for line in found}
     assert targets == {f"{b}-{r}" for b in ("pybullet", "sapien") for r in ROBOTS}
