@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-all demo test lint dist-check clean
+.PHONY: help setup setup-all demo test test-slow lint dist-check clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -27,7 +27,10 @@ demo: setup ## learn peg-in-hole from one demonstration and write a report
 # One thread a test process: two processes already fill two cores, and torch's threads would
 # wait for each other.
 test: setup-all ## run the tests (PYTEST_ARGS="-k name" for some of them)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+
+test-slow: setup-all ## run the tests that take minutes
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 
 lint: setup ## check style and types
 	$(BIN)/ruff check .

@@ -379,6 +379,7 @@ def test_the_replay_benchmark_compares_backends(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_short_rollouts")
+@pytest.mark.slow
 def test_every_task_runs_from_demonstration_to_report_on_every_backend(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
