@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,21 +17,8 @@ def test_every_export_resolves(name):
     assert getattr(sart, name) is not None
 
 
-def test_what_type_checkers_see_is_what_is_exported():
-    tree = ast.parse(Path(sart.__file__).read_text())
-    (block,) = (node for node in tree.body if isinstance(node, ast.If))
-    imported = {
-        alias.name: f"{node.module}".removeprefix("sart_toolkit.")
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    assert imported == sart._MODULES
-    assert dir(sart) == sorted(imported)
-
-
 def test_what_is_not_exported_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+    with pytest.raises(AttributeError, match="attribute nonsense"):
         _ = sart.nonsense
 
 

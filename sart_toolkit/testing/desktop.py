@@ -11,7 +11,6 @@ import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 
 from PIL import Image, ImageGrab
 
@@ -66,12 +65,7 @@ class Desktop:
     def __enter__(self) -> Desktop:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for program in self._programs:
             if program.poll() is None:
                 program.kill()

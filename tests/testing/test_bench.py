@@ -30,7 +30,15 @@ def test_a_module_in_the_working_folder_is_found(run_pytest, tmp_path):
         "from sart_toolkit.backends.pybullet import PyBulletBackend\n"
         "class Mine(PyBulletBackend):\n    pass\n"
     )
-    words = ["--sart-backend", "mine:Mine", "--sart-robot", "ur5e_hande", "-q", "-k", "abilities_are_known"]
+    words = [
+        "--sart-backend",
+        "mine:Mine",
+        "--sart-robot",
+        "ur5e_hande",
+        "-q",
+        "-k",
+        "abilities_are_known",
+    ]
     result = run_pytest(tmp_path, *words)
     assert "1 passed" in result.stdout, result.stdout + result.stderr
 
