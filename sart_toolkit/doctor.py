@@ -229,14 +229,14 @@ def probe_pybullet() -> str:
         pybullet.stepSimulation()
     height = pybullet.getBasePositionAndOrientation(ball)[0][2]
     _check_fall(height)
-    picture = pybullet.getCameraImage(
+    image = pybullet.getCameraImage(
         32,
         32,
         pybullet.computeViewMatrix([1, 0, height], [0, 0, height], [0, 0, 1]),
         pybullet.computeProjectionMatrixFOV(60, 1, 0.01, 5),
         renderer=pybullet.ER_TINY_RENDERER,
     )
-    _check_picture(bool((np.asarray(picture[4]) == ball).any()))
+    _check_image(bool((np.asarray(image[4]) == ball).any()))
     pybullet.disconnect(client)
     return f"{_version('pybullet')}, simulates and draws"
 
@@ -270,7 +270,7 @@ def probe_sapien_rendering() -> str:
     camera.entity.set_pose(sapien.Pose([-1, 0, 0]))
     scene.update_render()
     camera.take_picture()
-    _check_picture(bool((camera.get_picture("Segmentation")[..., 1] == ball.per_scene_id).any()))
+    _check_image(bool((camera.get_picture("Segmentation")[..., 1] == ball.per_scene_id).any()))
     return f"draws on {sapien.render.RenderSystem().device.name}"
 
 
@@ -288,7 +288,7 @@ def probe_open3d_offscreen() -> str:
     ball = open3d.geometry.TriangleMesh.create_sphere(0.2)
     renderer.scene.add_geometry("ball", ball, material)
     renderer.setup_camera(60.0, [0, 0, 0], [1, 0, 0], [0, 0, 1])
-    _check_picture(bool(np.ptp(np.asarray(renderer.render_to_image())) > 0))
+    _check_image(bool(np.ptp(np.asarray(renderer.render_to_image())) > 0))
     return f"{_version('open3d-cpu', 'open3d')}, draws"
 
 
@@ -411,9 +411,9 @@ def _check_fall(height: float) -> None:
         raise ProbeFailed(f"a ball dropped from 1 m is at {height:.3f} m after 0.25 s, not 0.693")
 
 
-def _check_picture(shows_ball: bool) -> None:
+def _check_image(shows_ball: bool) -> None:
     if not shows_ball:
-        raise ProbeFailed("a picture of a ball does not show it")
+        raise ProbeFailed("an image of a ball does not show it")
 
 
 def _version(*packages: str) -> str:

@@ -124,38 +124,38 @@ def noted(
 Found = TypeVar("Found")
 
 
-def _find(shown: Referring, kind: Kind, given: Any, get: Callable[[Any], Found]) -> Found:
+def _find(source: Referring, kind: Kind, given: Any, get: Callable[[Any], Found]) -> Found:
     """What is given, or else what a recording notes."""
     if given is not None:
         return get(given)
     try:
-        return get(shown.reference(kind))
+        return get(source.reference(kind))
     except UnknownName as error:
         raise UnknownName(
             f"{error}; it is what the recording notes: name another with --{kind} REF"
         ) from error
 
 
-def task_of(shown: Referring, task: TaskLike | None = None) -> Task:
+def task_of(source: Referring, task: TaskLike | None = None) -> Task:
     """The task of a recording or skill, or the one given.
 
     Raises:
         UnknownName: it can't be found.
     """
-    return _find(shown, "task", task, get_task)
+    return _find(source, "task", task, get_task)
 
 
-def robot_of(shown: Referring, robot: RobotLike | None = None) -> RobotSpec:
+def robot_of(source: Referring, robot: RobotLike | None = None) -> RobotSpec:
     """The robot of a recording or skill, or the one given.
 
     Raises:
         UnknownName: it can't be found.
     """
-    return _find(shown, "robot", robot, get_robot)
+    return _find(source, "robot", robot, get_robot)
 
 
 def backend_maker(
-    shown: Referring,
+    source: Referring,
     image_size: ImageSize,
     rates: Rates = DEFAULT_RATES,
     task: TaskLike | None = None,
@@ -167,13 +167,13 @@ def backend_maker(
     Raises:
         UnknownName: the robot, the task or the backend can't be found.
     """
-    scene = task_of(shown, task).scene
-    made = _find(shown, "backend", backend, get_backend)
-    return functools.partial(make_backend, made, robot_of(shown, robot), scene, image_size, rates)
+    scene = task_of(source, task).scene
+    made = _find(source, "backend", backend, get_backend)
+    return functools.partial(make_backend, made, robot_of(source, robot), scene, image_size, rates)
 
 
 def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
-    """Width and height of its pictures [pixels].
+    """Width and height of its images [pixels].
 
     Raises:
         InvalidInput: it holds none.
@@ -181,11 +181,11 @@ def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
     for camera in demonstration.steps.cameras.values():
         height, width = camera.rgb.shape[1:3]
         return width, height
-    raise InvalidInput("the demonstration holds no pictures; record it with a camera")
+    raise InvalidInput("the demonstration holds no images; record it with a camera")
 
 
 def _image_size_of_skill(skill: SkillConfig) -> tuple[int, int]:
-    """Width and height [pixels] of the pictures that a skill was shown."""
+    """Width and height [pixels] of the images that a skill was shown."""
     height, width = skill.cameras[skill.training.cameras[0]].size
     return width, height
 
@@ -237,8 +237,8 @@ def record(
         placement: where the object stands in its range.
         yaw_deg: a random placement is also turned within ± this [deg].
         vary_looks: whether colours, light and the wrist camera's mounting vary.
-        cameras: whose pictures are recorded.
-        image_size: width and height of pictures [pixels]; one number for a square.
+        cameras: whose images are recorded.
+        image_size: width and height of images [pixels]; one number for a square.
         seed: of all that is random.
         overwrite: whether `out` may be replaced.
         progress: hears of the seconds recorded.
@@ -309,7 +309,7 @@ def world_of(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
 ) -> CollisionWorld:
-    """Where the obstacles of a demonstration are, from its scene or from its pictures alone."""
+    """Where the obstacles of a demonstration are, from its scene or from its images alone."""
     from sart_toolkit.collision.cloud import CloudConfig
     from sart_toolkit.collision.world import make_world
 
@@ -607,8 +607,8 @@ def run(
         episodes: rollouts with random placements.
         epochs: of training, the policy's own if None.
         distribution: how positions are drawn on a sphere.
-        cameras: whose pictures are recorded and trained on.
-        image_size: width and height of recorded pictures [pixels]; one number for a square.
+        cameras: whose images are recorded and trained on.
+        image_size: width and height of recorded images [pixels]; one number for a square.
         seed: of all that is random, except evaluation.
         eval_seed: of the placements that are evaluated.
         workers: processes.

@@ -220,8 +220,8 @@ def test_a_spacemouse_is_named_and_none_is_no_fault(monkeypatch: pytest.MonkeyPa
     assert "none plugged in" in doctor.probe_spacemouse()
 
 
-def test_wrong_physics_and_an_empty_picture_are_caught() -> None:
+def test_wrong_physics_and_an_empty_image_are_caught() -> None:
     with pytest.raises(ProbeFailed, match=r"is at 1\.000 m"):
         doctor._check_fall(1.0)
     with pytest.raises(ProbeFailed, match="does not show it"):
-        doctor._check_picture(False)
+        doctor._check_image(False)

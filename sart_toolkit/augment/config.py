@@ -30,7 +30,7 @@ class AugmentConfig:
     paper. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
     proved to keep `margin` [m] free of the `obstacles`, the bodies of the scene or the cloud that
     the demonstration's cameras saw, even if what is grasped slips by `slip_tolerance` [m]; if any
-    point of it moves farther in the grasp the segment is rejected. `cameras`: whose pictures are
+    point of it moves farther in the grasp the segment is rejected. `cameras`: whose images are
     recorded, `None` for those of the demonstration. `executor`: how segments are carried out.
     `strategy` may be given as an object; its reference is kept.
     """

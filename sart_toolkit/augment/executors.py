@@ -77,7 +77,7 @@ class SegmentExecutor(abc.ABC):
 
         Raises:
             UnknownName: the backend has no such camera.
-            MissingCapability: pictures are wanted and the backend takes none.
+            MissingCapability: images are wanted and the backend takes none.
             Mismatch: a demonstration was recorded at other rates.
         """
         for demonstration in demonstrations:
@@ -125,7 +125,7 @@ class RestoreExecutor(SegmentExecutor):
 
         Raises:
             UnknownName: the backend has no such camera.
-            MissingCapability: the backend can't restore states, or pictures are wanted and it
+            MissingCapability: the backend can't restore states, or images are wanted and it
                 takes none.
             Mismatch: a demonstration holds no saved states, or was recorded at other rates.
         """

@@ -320,17 +320,17 @@ class _Radii:
     def __call__(self, name: str) -> dict[str, Any]:
         cell, config = self._cells[name], self._config
         with closing(cell.make_backend()) as backend:
-            shown = recorded(cell, backend, config.seed)
+            demonstration = recorded(cell, backend, config.seed)
             robot, bodies = backend.robot, backend.scene
         started = time.perf_counter()
-        world = ExactWorld(shown, robot, bodies)
-        for t in range(len(shown)):
+        world = ExactWorld(demonstration, robot, bodies)
+        for t in range(len(demonstration)):
             world.placed(t)
         built = time.perf_counter() - started
         seconds = []
         for _ in range(1 + _SUGGESTIONS):
             started = time.perf_counter()
-            annotation = suggest_annotation(shown, world, config=config.suggest)
+            annotation = suggest_annotation(demonstration, world, config=config.suggest)
             seconds.append(time.perf_counter() - started)
         rows = []
         with closing(self._make_checker(robot, bodies)) as checker:
@@ -339,7 +339,7 @@ class _Radii:
                 rows.append(attempt(sphere, np.random.default_rng([config.seed, i])))
         return {
             "cell": name,
-            "waypoints": len(shown),
+            "waypoints": len(demonstration),
             "seconds_build": built,
             "seconds_suggest_first": seconds[0],
             "seconds_suggest": float(np.median(seconds[1:])),

@@ -18,7 +18,7 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.benchmark.cells import WITHOUT_PICTURES, Cell, check_counts, recorded
+from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision.world import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
@@ -117,11 +117,11 @@ class _Segments:
             backend = cell.make_backend()
             try:
                 exact = self._augment.obstacles == "scene"
-                session = WITHOUT_PICTURES if exact else SessionConfig()
-                shown = recorded(cell, backend, self._augment.seed, session)
-                world = world_of(shown, backend.robot, backend.scene, self._augment)
-                annotation = suggest_annotation(shown, world)
-                executor = RestoreExecutor(backend, [(shown, annotation)], self._augment)
+                session = WITHOUT_IMAGES if exact else SessionConfig()
+                demonstration = recorded(cell, backend, self._augment.seed, session)
+                world = world_of(demonstration, backend.robot, backend.scene, self._augment)
+                annotation = suggest_annotation(demonstration, world)
+                executor = RestoreExecutor(backend, [(demonstration, annotation)], self._augment)
             except BaseException:
                 backend.close()
                 raise
@@ -135,7 +135,7 @@ class _Segments:
         sphere = annotation.spheres[at]
         started = time.perf_counter()
         proposal, rng = planner.proposal(at, k)
-        model, shown = planner.world.kinematics, planner.world.demonstration
+        model, demonstration = planner.world.kinematics, planner.world.demonstration
         motion: Motion | None = None
         row: dict[str, Any] = {
             "cell": name,
@@ -153,8 +153,8 @@ class _Segments:
         except (Unreachable, MotionRejected):
             pass
         else:
-            commanded = shown.steps.commanded_joint_positions
-            found = check_motion(model, motion, commanded[proposal.t_star], shown.rates)
+            commanded = demonstration.steps.commanded_joint_positions
+            found = check_motion(model, motion, commanded[proposal.t_star], demonstration.rates)
             row["planned"] = {
                 "clearance": certificate.clearance,
                 "duration": motion.duration,
@@ -168,7 +168,9 @@ class _Segments:
             row["measured"] = {
                 "clearance": proof["measured"]["clearance"],
                 "deviation": proof["deviation"],
-                "off": tool_off_path(model, motion, attempt.episode.joint_path, shown.rates),
+                "off": tool_off_path(
+                    model, motion, attempt.episode.joint_path, demonstration.rates
+                ),
             }
         return row | {"wall": time.perf_counter() - started}
 
@@ -191,7 +193,7 @@ def benchmark_segments(
 
     For each cell a demonstration of the scripted operator is recorded and spheres are suggested;
     the attempts are shared evenly among the cells, and go round-robin over a cell's spheres. No
-    pictures are taken but those that the obstacles are known from. Finished attempts are kept
+    images are taken but those that the obstacles are known from. Finished attempts are kept
     beside `out` until all are done: interrupted, it resumes.
 
     Args:

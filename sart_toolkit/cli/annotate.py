@@ -130,6 +130,6 @@ def _check_done(session: AnnotationSession) -> None:
 
 def _window_mode(session: AnnotationSession) -> None:
     window = importlib.import_module("sart_toolkit.annotate.open3d_window")
-    shown = session.demonstration
-    scene = pipeline.task_of(shown).scene
-    window.annotate_in_window(session, pipeline.robot_of(shown), scene)
+    demonstration = session.demonstration
+    scene = pipeline.task_of(demonstration).scene
+    window.annotate_in_window(session, pipeline.robot_of(demonstration), scene)

@@ -38,7 +38,7 @@ _EPOCHS = Annotated[int | None, _optional("INT", "Training epochs; the policy's 
 _WORKERS = Annotated[int, arg(help="Processes to use.")]
 _SEED = Annotated[int, arg(help="Seed of everything random in this step.")]
 _IMAGE = Annotated[
-    str, arg(help="Size of recorded pictures [pixels]: 128, or width and height as in 160x120.")
+    str, arg(help="Size of recorded images [pixels]: 128, or width and height as in 160x120.")
 ]
 _CAMERAS = Annotated[
     str, arg(help="Cameras to record and learn from, with commas between, such as wrist,overview.")
@@ -356,13 +356,13 @@ class Train:
     batch_size: Annotated[int | None, _optional("INT", "The policy's own if left out.")] = None
     image_size: Annotated[
         int | None,
-        _optional("INT", "Pictures are scaled to this [pixels]; the policy's own if left out."),
+        _optional("INT", "Images are scaled to this [pixels]; the policy's own if left out."),
     ] = None
     image_shift: Annotated[
         int | None,
         _optional(
             "INT",
-            "Random shift of the pictures, up to this [pixels]; the policy's own if left out.",
+            "Random shift of the images, up to this [pixels]; the policy's own if left out.",
         ),
     ] = None
     cameras: _CAMERAS = "wrist"
@@ -455,7 +455,7 @@ class BenchmarkSegments:
     """How augmentation's segments fare: kept, touched, off their path, beyond the joints' limits.
 
     On each task and backend a demonstration is recorded, spheres are suggested, and segments are
-    attempted from them in turn, without pictures. With --source cloud spheres and segments are
+    attempted from them in turn, without images. With --source cloud spheres and segments are
     proved against what the demonstration's camera saw, and executed in the true scene.
 
     Example: sart benchmark segments --tasks all --backends pybullet --count 10000
@@ -503,7 +503,7 @@ class BenchmarkRadii:
 
 @dataclass(frozen=True)
 class BenchmarkCloud:
-    """How radii from the recorded pictures compare with those from the true scene.
+    """How radii from the recorded images compare with those from the true scene.
 
     Example: sart benchmark cloud --tasks all --out cloud.json
     """
@@ -545,7 +545,7 @@ class BenchmarkSkill:
 
 @dataclass(frozen=True)
 class Report:
-    """Write the page about a run: pictures, videos and figures in one HTML file.
+    """Write the page about a run: images, videos and figures in one HTML file.
 
     Example: sart report runs/peg
 

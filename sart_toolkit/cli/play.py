@@ -23,14 +23,16 @@ def play_verb(args: Play) -> dict[str, Any]:
     pipeline.check_names(task=args.task, robot=args.robot, backend=args.backend)
     check_play_options(args)
     playback = load_playback(args.file)
-    shown = playback.demonstration
-    if args.camera in shown.steps.cameras:
+    demonstration = playback.demonstration
+    if args.camera in demonstration.steps.cameras:
         playback.camera = args.camera
         return play(args, playback, None)
     from sart_toolkit.report.player import SceneView
 
-    size = pipeline.image_size_of(shown)
-    make = pipeline.backend_maker(shown, size, shown.rates, args.task, args.robot, args.backend)
+    size = pipeline.image_size_of(demonstration)
+    make = pipeline.backend_maker(
+        demonstration, size, demonstration.rates, args.task, args.robot, args.backend
+    )
     with closing(make()) as backend:
         return play(args, playback, SceneView(playback, backend, args.camera))
 

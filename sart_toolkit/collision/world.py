@@ -123,7 +123,7 @@ def make_world(
         scene: the task's scene; of "cloud", only what is fixed to the robot is looked at, and the
             names of the bodies that can be lifted.
         slip_tolerance: how far [m] a grasped object may move in the grasp.
-        cloud: how pictures become a cloud.
+        cloud: how images become a cloud.
 
     Raises:
         UnknownName: no such source.

@@ -181,7 +181,7 @@ class CameraRecord:
 
     def __repr__(self) -> str:
         n, height, width, _ = self.rgb.shape
-        return summary(self, pictures=n, width=width, height=height)
+        return summary(self, images=n, width=width, height=height)
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Steps:
         object.__setattr__(self, "contact_force", frozen(force))
         for name, camera in self.cameras.items():
             if len(camera.rgb) != n:
-                raise InvalidInput(f"camera {name!r}: expected {n} pictures, got {len(camera.rgb)}")
+                raise InvalidInput(f"camera {name!r}: expected {n} images, got {len(camera.rgb)}")
         object.__setattr__(self, "cameras", dict(self.cameras))
 
     def __len__(self) -> int:

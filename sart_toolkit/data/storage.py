@@ -380,7 +380,7 @@ def _put_steps(group: h5py.Group, steps: Steps) -> None:
         group[name] = getattr(steps, name)
     for name, camera in steps.cameras.items():
         at = group.create_group(f"cameras/{name}")
-        # One chunk a picture, LZF: a tenth of gzip's time, and a step can be read by itself.
+        # One chunk an image, LZF: a tenth of gzip's time, and a step can be read by itself.
         for part, frames in (("rgb", camera.rgb), ("depth", camera.depth)):
             at.create_dataset(
                 part, data=frames, chunks=(1, *frames.shape[1:]), compression="lzf", shuffle=True

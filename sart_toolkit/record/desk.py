@@ -201,13 +201,13 @@ class RecordingDesk:
 
     def _keep(self) -> None:
         session, device = self.session, self.device
-        shown = session.demonstration(device.operator, device.name, session.seconds_spent)
+        demonstration = session.demonstration(device.operator, device.name, session.seconds_spent)
         try:
-            self._save(shown)
+            self._save(demonstration)
         except SartError as error:
             self._said = Notice(f"Not saved: {error}. → tries again; nothing is lost.", "bad")
             return
-        self.demonstration = shown
+        self.demonstration = demonstration
         session.mark_saved()
 
     def _tell(self) -> None:

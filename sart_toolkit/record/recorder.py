@@ -22,7 +22,7 @@ class StepRecorder:
     """
 
     def __init__(self, backend: Backend, model: RobotModel, cameras: Sequence[str]) -> None:
-        """Record `backend` with the named cameras' pictures.
+        """Record `backend` with the named cameras' images.
 
         Args:
             backend: the robot.
@@ -31,7 +31,7 @@ class StepRecorder:
 
         Raises:
             UnknownName: there is no such camera.
-            MissingCapability: the backend takes no pictures.
+            MissingCapability: the backend takes no images.
             InvalidInput: a camera is mounted on a part of the arm before the tool.
         """
         backend.check_cameras(cameras)

@@ -180,7 +180,7 @@ class TeleopSession:
 
         Raises:
             UnknownName: there is no such camera.
-            MissingCapability: the backend takes no pictures.
+            MissingCapability: the backend takes no images.
         """
         self.backend, self.task, self.model = backend, task, model
         self.placement = placement or Placement()
@@ -232,7 +232,7 @@ class TeleopSession:
 
     @property
     def recorded(self) -> Observation:
-        """What was recorded last, with the pictures of the session's cameras."""
+        """What was recorded last, with the images of the session's cameras."""
         return self._recorder.observations[-1]
 
     @property
@@ -522,7 +522,7 @@ def record_demonstration(
     Raises:
         InvalidInput: the device did not stop within `max_seconds`.
         UnknownName: there is no such camera.
-        MissingCapability: the backend takes no pictures.
+        MissingCapability: the backend takes no images.
     """
     session = TeleopSession(backend, task, model, placement, config)
     session.start()

@@ -148,7 +148,7 @@ class RecordingWindow:
     def draw(self) -> None:
         """Draw the window once."""
         self._screen.clear()
-        self._screen.picture(_SCENE, self._scene_picture())
+        self._screen.image(_SCENE, self._scene_image())
         self._head()
         self._wrist_and_settings()
         self._notice()
@@ -156,7 +156,7 @@ class RecordingWindow:
         self._keys()
         self._screen.show()
 
-    def _scene_picture(self) -> Image:
+    def _scene_image(self) -> Image:
         """The scene as it is: small and often while it moves, sharp once it stands still."""
         session = self._desk.session
         state = (id(session.recorded), session.seconds)
@@ -194,7 +194,7 @@ class RecordingWindow:
         screen, desk = self._screen, self._desk
         session, device = desk.session, desk.device
         camera = session.config.cameras[0]
-        screen.picture((800, 140, 280, 280), session.recorded.cameras[camera].rgb)
+        screen.image((800, 140, 280, 280), session.recorded.cameras[camera].rgb)
         screen.box((806, 394, 20 + 8 * len(camera), 20), BACKGROUND, radius=4)
         screen.text((812, 395), camera, 13, FAINT)
         left = 1096

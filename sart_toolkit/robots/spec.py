@@ -120,7 +120,7 @@ class CameraSpec:
     """An RGB-D camera on a frame of the robot, or in the world where `frame` is "world".
 
     `T_frame_camera`: camera frame z forward, x right, y down. `fov_y_deg`: vertical field of view;
-    pictures are square-pixel, the horizontal field follows from the picture's shape.
+    images are square-pixel, the horizontal field follows from the image's shape.
     """
 
     name: str
@@ -149,7 +149,7 @@ ImageSize = int | str | tuple[int, int]
 
 
 def check_image_size(value: ImageSize) -> tuple[int, int]:
-    """A picture's width and height [pixels].
+    """An image's width and height [pixels].
 
     Args:
         value: (width, height), text such as "160x120", or one number for a square.

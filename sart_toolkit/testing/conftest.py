@@ -81,7 +81,7 @@ def jointed(_in_scene: Callable[[str], Bench]) -> Bench:
 def view(_in_scene: Callable[[str], Bench]) -> Bench:
     """Things to see."""
     bench = _in_scene("view")
-    bench.needs_pictures()
+    bench.needs_images()
     return bench
 
 

@@ -167,7 +167,7 @@ def jointed_scene(robot: RobotSpec) -> SceneSpec:
 def view_scene(robot: RobotSpec) -> SceneSpec:
     """A green ball and a magenta bead before three cameras, and a room underground with a fourth.
 
-    The ball is at the middle of the cameras' pictures, the bead off it, so that where they appear
+    The ball is at the middle of the cameras' images, the bead off it, so that where they appear
     tells how a camera stands whatever its field of view. The room's walls all look alike and are
     equally far away, so that the camera in its middle tells its field of view and its depth even
     where it looks along a wrong axis. The camera `nowhere` has nothing before it.

@@ -196,7 +196,7 @@ def test_saving_changes_nothing(bench: Bench) -> None:
 
 
 def test_what_follows_a_restore_depends_on_the_saved_state_alone(bench: Bench) -> None:
-    """To the bit, contacts and pictures included, whatever ran in between."""
+    """To the bit, contacts and images included, whatever ran in between."""
     bench.needs(SavesStates)
     bench.relies_on_repeating()
     state = _pressing(bench)
@@ -209,7 +209,7 @@ def test_what_follows_a_restore_depends_on_the_saved_state_alone(bench: Bench) -
     ):
         between()
         bench.states.restore(state)
-        continuations.append([bench.digest(pictures=True), *bench.continuation()])
+        continuations.append([bench.digest(images=True), *bench.continuation()])
     for continuation in continuations[1:]:
         assert continuation == continuations[0]
 

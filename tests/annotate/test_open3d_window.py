@@ -57,7 +57,7 @@ def test_every_key_does_in_the_window_what_the_table_says(
     keys = [key for key, name in KEYS.items() if name not in ("save", "quit")]
     for key in ["A", *keys]:
         done = len(rows(tmp_path))
-        # A window takes keys only once its first picture stands.
+        # A window takes keys only once its first image stands.
         screen.key(x_name(key))
         wait_until(lambda done=done: len(rows(tmp_path)) > done, 60)
         assert rows(tmp_path)[-1]["action"] == KEYS[key]

@@ -195,7 +195,7 @@ def test_an_unwritable_place_is_told_before_anything_is_asked(refused, demo, tmp
     assert "permission denied" in refused(demo, "--text", "--out", place / "a.json")
 
 
-def test_spheres_can_be_annotated_from_the_recorded_pictures_alone(annotate, demo):
+def test_spheres_can_be_annotated_from_the_recorded_images_alone(annotate, demo):
     result, said = annotate(demo, "--text", "--source", "cloud", words="suggest save quit")
     assert "peg / cloud" in said and result["saved"]
 

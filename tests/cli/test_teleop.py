@@ -146,9 +146,9 @@ def test_what_can_t_be_steered_with_is_one_line(tmp_path, capsys, dummy, options
 def test_a_backend_that_draws_nothing_can_t_be_steered_by_hand(
     tmp_path, capsys, dummy, monkeypatch
 ):
-    monkeypatch.setattr(PyBulletBackend, "no_pictures", "it has no eyes")
+    monkeypatch.setattr(PyBulletBackend, "no_images", "it has no eyes")
     said = error(capsys, *RECORD, tmp_path / "d.h5", *BY_HAND)
-    assert "backend 'pybullet' takes no pictures: it has no eyes" in said
+    assert "backend 'pybullet' takes no images: it has no eyes" in said
 
 
 @pytest.mark.window

@@ -1,4 +1,4 @@
-"""Radii from recorded pictures alone: never much larger than those from the true scene."""
+"""Radii from recorded images alone: never much larger than those from the true scene."""
 
 import dataclasses
 
@@ -59,11 +59,11 @@ def toolbox():
 
 @pytest.mark.parametrize("name", ["peg", "toolbox"])
 def test_radii_are_no_larger_than_the_exact_ones_by_2_mm_and_mostly_nearly_as_large(name, request):
-    shown = request.getfixturevalue(name)
+    demo = request.getfixturevalue(name)
     ratios = []
-    for sphere in suggest_annotation(shown.demonstration, shown.exact).spheres:
-        exact = suggest_radius(shown.exact, shown.demonstration, sphere.waypoint, FINE)
-        seen = suggest_radius(shown.cloud, shown.demonstration, sphere.waypoint, FINE)
+    for sphere in suggest_annotation(demo.demonstration, demo.exact).spheres:
+        exact = suggest_radius(demo.exact, demo.demonstration, sphere.waypoint, FINE)
+        seen = suggest_radius(demo.cloud, demo.demonstration, sphere.waypoint, FINE)
         assert seen.radius <= exact.radius + 0.002, sphere
         ratios.append(seen.radius / exact.radius)
     assert np.median(ratios) >= 0.5 and ratios[0] > 0.9

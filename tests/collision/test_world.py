@@ -1,4 +1,4 @@
-"""One interface to obstacles, whether they are known from a description or from pictures."""
+"""One interface to obstacles, whether they are known from a description or from images."""
 
 import dataclasses
 
@@ -62,13 +62,13 @@ def test_a_pair_that_is_too_close_is_told_by_its_names(world):
 
 
 def test_only_what_is_known_to_move_is_told_to(picked, first_grasp, toolbox):
-    shown, robot = picked.demonstration, get_robot(toolbox.robot)
+    demo, robot = picked.demonstration, get_robot(toolbox.robot)
     assert picked.moving(0) is None and picked.moving(first_grasp + 5) is None
     # Carried away without being in the grasp, that is.
-    told = ExactWorld(dataclasses.replace(shown, touching=((),) * len(shown)), robot, toolbox.scene)
+    told = ExactWorld(dataclasses.replace(demo, touching=((),) * len(demo)), robot, toolbox.scene)
     assert told.moving(first_grasp + 10) == "toolbox"
-    seen = CloudWorld(shown, robot, toolbox.scene)
-    assert all(seen.moving(t) is None for t in range(len(shown)))
+    seen = CloudWorld(demo, robot, toolbox.scene)
+    assert all(seen.moving(t) is None for t in range(len(demo)))
 
 
 def test_nothing_of_the_scene_but_what_was_seen_enters_a_cloud_s_certificate(

@@ -22,9 +22,9 @@ from sart_toolkit.errors import BrokenFile, Mismatch, MissingFile
 
 
 @pytest.fixture
-def made(shown, episode_of, tmp_path):
+def made(source_of, episode_of, tmp_path):
     """Two demonstrations, each with episodes from both of its spheres."""
-    sources = [shown(0), shown(1)]
+    sources = [source_of(0), source_of(1)]
     episodes = [
         episode_of(sources[source][0], sphere, k, source)
         for source in (0, 1)
@@ -132,17 +132,17 @@ def test_a_missing_or_exchanged_episode_is_told_when_it_is_read(made, episode_of
         dataset.episode(3)
 
 
-def test_an_episode_of_another_demonstration_is_a_mismatch(shown, episode_of, tmp_path):
-    stranger = episode_of(shown(5)[0])
-    dataset = write_dataset(tmp_path / "d", [shown(0)], [stranger], {})
+def test_an_episode_of_another_demonstration_is_a_mismatch(source_of, episode_of, tmp_path):
+    stranger = episode_of(source_of(5)[0])
+    dataset = write_dataset(tmp_path / "d", [source_of(0)], [stranger], {})
     with pytest.raises(Mismatch, match="sphere00_k00000.h5 was generated from another demonst"):
         list(dataset)
 
 
-def test_another_demonstration_or_annotation_in_a_source_s_place_is_a_mismatch(made, shown):
+def test_another_demonstration_or_annotation_in_a_source_s_place_is_a_mismatch(made, source_of):
     path, *_ = made
     source = load_dataset(path).sources[0]
-    save_demonstration(source.path / "demo.h5", shown(1)[0])
+    save_demonstration(source.path / "demo.h5", source_of(1)[0])
     annotation = load_annotation(source.path / "annotation.json")
     wider = dataclasses.replace(annotation.spheres[0], radius=0.2)
     save_annotation(

@@ -125,7 +125,7 @@ def test_steering_out_of_reach_ends_the_rollout_with_that_reason(roll_out, peg_m
     assert result.reason.startswith("steered out of reach: tool pose at (")
 
 
-def test_a_skill_sees_the_wrist_picture_and_the_gripper_at_every_step(
+def test_a_skill_sees_the_wrist_image_and_the_gripper_at_every_step(
     roll_out, replay, peg_demonstration
 ):
     result = roll_out(replay)
@@ -139,17 +139,17 @@ def test_a_skill_sees_the_wrist_picture_and_the_gripper_at_every_step(
 def test_the_same_rollout_twice_is_the_same(roll_out, replay):
     task = get_task("peg_in_hole")
     task.horizon = 3.0
-    pictures = []
+    images = []
     for _ in range(2):
-        pictures.append([])
+        images.append([])
         roll_out(
             replay,
             Placement(0.01, 0.02),
             task,
-            watch=lambda seen, *_: pictures[-1].append(seen.cameras["wrist"].rgb),
+            watch=lambda seen, *_: images[-1].append(seen.cameras["wrist"].rgb),
         )
-    np.testing.assert_array_equal(*pictures)
-    assert len(pictures[0]) >= 30
+    np.testing.assert_array_equal(*images)
+    assert len(images[0]) >= 30
 
 
 # --- many rollouts ------------------------------------------------------------------------------
@@ -196,7 +196,7 @@ def test_objects_are_turned_and_looks_vary_where_asked_for(evaluate, short_task)
         player.rollouts = []
         rows = evaluate(player, short_task, EvaluateConfig(3, 0, **options))["episodes"]
         placements[name] = [row["placement"]["block"] for row in rows]
-        # The table's colour in the corner of each rollout's first picture.
+        # The table's colour in the corner of each rollout's first image.
         tables[name] = {tuple(seen[0][0][-1, 0]) for seen in player.rollouts}
     assert placements["plain"] == placements["looks"]
     assert {p["yaw_deg"] for p in placements["plain"]} == {0.0}

@@ -51,7 +51,7 @@ def test_windows_are_exactly_the_steps_of_all_trajectories(
     assert len(found) == len(windows.history)
 
 
-def test_each_picture_is_stored_once(make_dataset, open_windows):
+def test_each_image_is_stored_once(make_dataset, open_windows):
     dataset = make_dataset((2,) * 20)
     windows = open_windows(dataset)
     assert len(windows.frames.images["wrist"]) == len(dataset.sources[0].demonstration) + 20 * 4

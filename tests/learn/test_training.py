@@ -57,7 +57,7 @@ def test_it_learns_where_the_blob_is_and_transfers_to_images_never_seen(
     with torch.inference_mode():
         predicted = result.policy.predict(batch)
     actions = batch["action"]
-    # The last action of a trajectory holds still whatever the picture shows.
+    # The last action of a trajectory holds still whatever the image shows.
     moving = actions[:, :2].abs().sum(1) > 0
     error = (predicted - actions)[moving, :2].square().mean()
     assert error < 0.05 * actions[moving, :2].var(0).mean()

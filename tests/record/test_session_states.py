@@ -147,8 +147,8 @@ def test_it_ends_by_itself_once_success_has_lasted(session, peg_task):
         held.append(session.success_held)
     assert session.end is End.SUCCESS and session.achieved
     assert session.success_held == pytest.approx(peg_task.hold)
-    shown = session.demonstration("p", "d", 1.0)
-    assert shown.success[-10:].all() and not shown.success[-11]
+    demo = session.demonstration("p", "d", 1.0)
+    assert demo.success[-10:].all() and not demo.success[-11]
     assert max(held) == held[-1]
 
 

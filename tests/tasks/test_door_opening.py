@@ -60,7 +60,7 @@ def _shifted(stages, p_cabinet):
 
 
 def _handle_pixels(rgb):
-    """How many pixels of pictures `(..., H, W, 3)` have the handle's yellow."""
+    """How many pixels of images `(..., H, W, 3)` have the handle's yellow."""
     return (rgb[..., 0].astype(int) - rgb[..., 2] > 80).sum((-2, -1))
 
 

@@ -58,7 +58,7 @@ def _raised(stages, height):
 
 
 def _rim_pixels(rgb):
-    """How many pixels of pictures `(..., H, W, 3)` have the yellow of the notch's rim."""
+    """How many pixels of images `(..., H, W, 3)` have the yellow of the notch's rim."""
     return (rgb[..., 0].astype(int) - rgb[..., 2] > 80).sum((-2, -1))
 
 

@@ -55,7 +55,7 @@ def _object(task):
 
 
 def _seen_pixels(backend, names):
-    """How many of the wrist picture's pixels show one of some bodies, by depth."""
+    """How many of the wrist image's pixels show one of some bodies, by depth."""
     seen = backend.observe(("wrist",))
     view = seen.cameras["wrist"]
     size = len(view.depth)

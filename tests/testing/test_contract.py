@@ -23,7 +23,7 @@ def _told(outcome):
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
-    """Nothing is skipped; pictures may be where SART_NO_PICTURES says that nothing can draw."""
+    """Nothing is skipped; images may be where SART_NO_IMAGES says that nothing can draw."""
     try:
         made = make_backend(backend, get_robot(robot), SceneSpec(()), 8)
     except MissingExtra as error:
@@ -31,8 +31,8 @@ def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
     made.close()
     outcome = run_suite([backend], robot)[backend]
     assert not outcome.failed, _told(outcome)
-    if os.environ.get("SART_NO_PICTURES"):
-        assert all("lacks pictures" in reason for reason in outcome.skipped.values())
+    if os.environ.get("SART_NO_IMAGES"):
+        assert all("lacks images" in reason for reason in outcome.skipped.values())
     else:
         assert outcome.skipped == {}
 
@@ -48,7 +48,7 @@ def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
                 "SavesStates",
                 "KnowsBodies",
                 "SensesContacts",
-                "pictures: it has no cameras",
+                "images: it has no cameras",
             },
         ),
     ],

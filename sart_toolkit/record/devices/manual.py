@@ -46,7 +46,7 @@ class Views:
     """Which way is which for a hand that moves right, forward and up by what is on the screen.
 
     `R_world_hand (3, 3)`: right and away in the scene view, level, and vertically up.
-    `R_tool_hand (3, 3)`: right and upwards in the wrist picture, and back out along the tool.
+    `R_tool_hand (3, 3)`: right and upwards in the wrist image, and back out along the tool.
     """
 
     R_world_hand: Array

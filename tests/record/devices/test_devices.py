@@ -61,7 +61,7 @@ def settled(device, observation, periods=60):
 
 
 def test_world_directions_are_those_of_the_scene_view(puppet, peg_task, make_session):
-    """Right moves right in the picture, forward away from the camera, up moves up."""
+    """Right moves right in the image, forward away from the camera, up moves up."""
     now = make_session().observation
     R_world_tool = now.T_world_tool[:3, :3]
     R_world_camera = peg_task.scene.cameras[0].T_frame_camera[:3, :3]
@@ -88,7 +88,7 @@ def test_tool_directions_are_those_of_the_wrist_view(puppet, make_session):
     )
     assert right[0] == pytest.approx(0.06)
     assert forward[1] < -0.03
-    assert up[2] < -0.03, "out of the picture, back along the tool"
+    assert up[2] < -0.03, "out of the image, back along the tool"
 
 
 def test_without_a_camera_in_the_scene_the_person_stands_behind_the_robot(peg_model, peg_task):
