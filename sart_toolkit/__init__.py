@@ -109,7 +109,7 @@ if TYPE_CHECKING:
         check_image_size,
         look_at,
     )
-    from sart_toolkit.scenes.appearance import AppearanceConfig, vary_appearance
+    from sart_toolkit.scenes.appearance import AppearanceConfig, randomise_appearance
     from sart_toolkit.scenes.spec import Body, Detent, Joint, Light, SceneSpec, SceneState
     from sart_toolkit.tasks import TASKS, get_task
     from sart_toolkit.tasks.task import Placement, PlanStep, Task
@@ -278,7 +278,7 @@ _HOMES = {
     ),
     "scenes.appearance": (
         "AppearanceConfig",
-        "vary_appearance",
+        "randomise_appearance",
     ),
     "scenes.spec": (
         "Body",

@@ -27,7 +27,7 @@ _SUDO = "" if os.geteuid() == 0 else "sudo "
 
 
 class ProbeFailed(SartError, RuntimeError):
-    """Something that the doctor tried out does not do what it should."""
+    """Something that the doctor tested does not do what it should."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class Finding:
     """One answer of the doctor.
 
     Attributes:
-        name: what was looked at.
+        name: what was checked.
         ok: whether it works.
         detail: what was found, or what went wrong.
         remedy: what to do about it; empty where `ok`.
         required: whether the toolkit is of no use without it.
-        tried: whether it was tried out, and not only found to be installed.
+        tested: whether it was tested, and not only found to be installed.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Finding:
     detail: str
     remedy: str = ""
     required: bool = False
-    tried: bool = True
+    tested: bool = True
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Probe:
     """One question to the machine, asked in a process of its own.
 
     Attributes:
-        name: what is looked at.
+        name: what is checked.
         target: `module:function`; the function returns what it found, or raises.
         extra: the extra of sart_toolkit that it belongs to; empty for the core.
         remedy: what to do where the function fails, other than for a missing package or library.
@@ -77,9 +77,9 @@ class Probe:
 def diagnose(full: bool = True) -> list[Finding]:
     """What works on this machine, required things first.
 
-    Simulators and renderers are tried out for real, each in a process of its own, so that one
-    that crashes or hangs is a finding and not the end of the doctor. Unless `full`, of what is not
-    required it is only looked up whether it is installed.
+    Simulators and renderers are really run, each in a process of its own, so that one
+    that crashes or hangs is a finding and not the end of the doctor. Unless `full`, what is
+    not required is only checked to be installed.
     """
     probe = run_probe if full else _quick_finding
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
@@ -94,7 +94,7 @@ def _quick_finding(probe: Probe) -> Finding:
         return _broken(
             probe, f"{probe.packages[0]} is not installed", _remedy(probe, "ModuleNotFoundError")
         )
-    return Finding(probe.name, True, f"{_version(*probe.packages)}, not tried", tried=False)
+    return Finding(probe.name, True, f"{_version(*probe.packages)}, not tested", tested=False)
 
 
 def _is_installed(package: str) -> bool:

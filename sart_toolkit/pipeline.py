@@ -80,7 +80,7 @@ Kind = Literal["robot", "task", "backend"]
 
 
 class Progress(Protocol):
-    """Hears how far a stage is: its name, what is done of the total (if known), and a few words."""
+    """Called with a stage's name, what is done of the total (if known), and a few words."""
 
     def __call__(
         self, stage: str, done: float, total: float | None = None, text: str = "", /
@@ -214,7 +214,7 @@ def record(
     max_seconds: float = 120.0,
     placement: Literal["middle", "random"] = "middle",
     yaw_deg: float = 0.0,
-    vary_looks: bool = False,
+    vary_appearance: bool = False,
     cameras: Sequence[str] = ("wrist",),
     image_size: ImageSize = 128,
     seed: int = 0,
@@ -236,12 +236,12 @@ def record(
         max_seconds: the longest it may take [s].
         placement: where the object stands in its range.
         yaw_deg: a random placement is also turned within ± this [deg].
-        vary_looks: whether colours, light and the wrist camera's mounting vary.
+        vary_appearance: whether colours, light and the wrist camera's mounting vary.
         cameras: whose images are recorded.
         image_size: width and height of images [pixels]; one number for a square.
         seed: of all that is random.
         overwrite: whether `out` may be replaced.
-        progress: hears of the seconds recorded.
+        progress: called with the seconds recorded.
 
     Raises:
         UnknownName: a name or reference leads to nothing.
@@ -256,7 +256,7 @@ def record(
     check_writable(out, overwrite)
     from sart_toolkit.record.session import DeviceSetup, SessionConfig, record_demonstration
     from sart_toolkit.robots.model import RobotModel
-    from sart_toolkit.scenes.appearance import vary_appearance
+    from sart_toolkit.scenes.appearance import randomise_appearance
     from sart_toolkit.tasks.task import Placement
 
     found = get_task(task)
@@ -273,8 +273,8 @@ def record(
         max_seconds,
         references={k: v for k, v in references.items() if v is not None},
     )
-    if vary_looks:
-        spec, scene = vary_appearance(spec, scene, np.random.default_rng([seed, 1]))
+    if vary_appearance:
+        spec, scene = randomise_appearance(spec, scene, np.random.default_rng([seed, 1]))
     with closing(make_backend(backend, spec, scene, size)) as made:
         model = RobotModel(made.robot, made.scene.held)
         setup = DeviceSetup(
@@ -343,7 +343,7 @@ def suggest(
         slip_tolerance: how far what is grasped may move in the grasp [m].
         task, robot: in place of those that the demonstration notes.
         overwrite: whether `out` may be replaced.
-        progress: hears of the waypoints done.
+        progress: called with the waypoints done.
         options: of `SuggestConfig`.
 
     Raises:
@@ -390,7 +390,7 @@ def augment(
         task, robot, backend: in place of those that the demonstration notes.
         workers: processes.
         overwrite: whether `out` may be replaced.
-        progress: hears of the trajectories kept.
+        progress: called with the trajectories kept.
         options: of `AugmentConfig`.
 
     Raises:
@@ -426,7 +426,7 @@ def validate(
     Args:
         dataset: directory from `augment`.
         task, robot: in place of those that its demonstration notes.
-        progress: hears of the episodes done.
+        progress: called with the episodes done.
 
     Raises:
         MissingFile, BrokenFile, Mismatch: as `validate_dataset`.
@@ -458,7 +458,7 @@ def train_policy(
         out: directory to write; an interrupted training resumes.
         policy: what is trained.
         overwrite: whether a skill in `out` may be replaced.
-        progress: hears of the steps done.
+        progress: called with the steps done.
         options: of `TrainConfig`; the policy's own where left out or None.
 
     Raises:
@@ -512,7 +512,7 @@ def evaluate(
         workers: processes.
         device: where the policy runs.
         overwrite: whether `out` may be replaced.
-        progress: hears of the rollouts done.
+        progress: called with the rollouts done.
         options: of `EvaluateConfig`.
 
     Raises:
@@ -538,11 +538,11 @@ def evaluate(
 
         film = film_rollout
 
-    def hear(done: int, wanted: int, successes: int) -> None:
+    def report_progress(done: int, wanted: int, successes: int) -> None:
         progress("evaluate", done, wanted, f"{successes}/{done} succeeded")
 
     return evaluate_skill(
-        skill, task_of(about, task), make, config, out, workers, device, hear, film
+        skill, task_of(about, task), make, config, out, workers, device, report_progress, film
     )
 
 
@@ -615,7 +615,7 @@ def run(
         device: where training and the policy run: "auto", "cpu" or "cuda".
         overwrite: whether a run in `out` may be replaced.
         command: how it was asked for, kept with the run.
-        progress: hears of each stage.
+        progress: called with the progress of each stage.
 
     Raises:
         UnknownName: a name or reference leads to nothing.

@@ -132,8 +132,8 @@ def peg_demonstration(
 ) -> Demonstration:
     """The scripted operator's demonstration with seed 0, the hole in the middle."""
     backend = make_peg_backend()
-    stages = peg_task.plan(peg_task.initial_state(peg_model, Placement()))
-    operator = ScriptedOperator(stages, np.random.default_rng(0))
+    plan = peg_task.plan(peg_task.initial_state(peg_model, Placement()))
+    operator = ScriptedOperator(plan, np.random.default_rng(0))
     demonstration = record_demonstration(backend, peg_task, peg_model, operator, seed=0)
     backend.close()
     return demonstration

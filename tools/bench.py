@@ -288,7 +288,7 @@ def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
     imports included, is what is reported: all of it, and the part that no file backs. Only then the
     images are copied into memory, and steps on batches from the file and from the copy alternate,
     so that whatever else the machine does slows both; the ratios, of time that passed and of the
-    processor's time, are medians over blocks of steps. `file_from_disk`: after the kernel was told
+    processor's time, are medians over blocks of steps. `file_from_disk`: after the kernel was asked
     to drop what it keeps of the file.
     """
     parser = argparse.ArgumentParser(
@@ -503,7 +503,7 @@ def _measured(work: str, *arguments: Any) -> dict[str, Any]:
 def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
     """Kept trajectories per second and simulated over wall time, one process, RGB and depth kept.
 
-    A whole call of the engine each time: loading the simulator, every try, writing the episodes.
+    A whole call of the engine each time: the simulator, every attempt, writing the episodes.
     """
     parser = argparse.ArgumentParser(prog="bench.py augment", description=bench_augment.__doc__)
     parser.add_argument("--task", default="peg_in_hole", help=", ".join(TASKS))
@@ -571,7 +571,7 @@ class _Setting(NamedTuple):
 def bench_certificate(arguments: Sequence[str]) -> dict[str, Any]:
     """Time and soundness of certificates on random straight segments, by scene.
 
-    Every registered task's scene, its object placed anew for every 50 segments, and four kinds of
+    Every registered task's scene, its object placed again for every 50 segments, and four kinds of
     generated ones, another every 50 segments; half of the segments pass near something. Each
     verdict is held against PyBullet's closest points at many configurations of the same path: a
     certified segment that collides there is unsound; one that isn't certified although it clears
@@ -617,7 +617,7 @@ def bench_certificate(arguments: Sequence[str]) -> dict[str, Any]:
 
 def _setting(kind: str, rng: np.random.Generator) -> _Setting:
     """A task's scene at a random placement, or a generated one."""
-    carried: dict[str, Array] = {}
+    grasped: dict[str, Array] = {}
     if kind in TASKS:
         task = get_task(kind)
         robot = get_robot(task.robot)
@@ -629,7 +629,7 @@ def _setting(kind: str, rng: np.random.Generator) -> _Setting:
         fingers = robot.gripper.finger_links
         touching = [probe.names(k) for k, d in enumerate(probe.distances(home)) if d < 1e-3]
         T_tool_world = inverse(model.fk(home))
-        carried = {name: T_tool_world @ Ts[name] for name in scene.grasped(touching, fingers)}
+        grasped = {name: T_tool_world @ Ts[name] for name in scene.grasped(touching, fingers)}
     else:
         robot = get_robot("ur5e_2f85")
         scene = CLUTTER[kind](rng)
@@ -639,11 +639,11 @@ def _setting(kind: str, rng: np.random.Generator) -> _Setting:
     standing = tuple(
         dataclasses.replace(body, T_world_body=Ts[body.name])
         for body in scene.bodies
-        if body.name not in carried
+        if body.name not in grasped
     )
     closest = ClosestPoints(robot, scene, joints_apart=2)
-    closest.place(Ts, gripper, carried)
-    placed = CollisionModel(robot, scene).placed(Ts, gripper, carried)
+    closest.place(Ts, gripper, grasped)
+    placed = CollisionModel(robot, scene).placed(Ts, gripper, grasped)
     return _Setting(kind, placed, closest, model, SceneSpec(standing), home)
 
 

@@ -1,7 +1,7 @@
-"""What a person does, done by machine hands in the real windows: `python tools/human_path.py DIR`.
+"""A person's way through the real windows, by scripted input: `python tools/human_path.py DIR`.
 
 A demonstration is recorded with the keyboard and annotated, then augmented and trained on, and the
-skill is tried. A screen that nobody looks at shows the windows, keys are pressed on it as fingers
+skill is evaluated. A virtual screen shows the windows, keys are pressed on it as fingers
 would, and images are taken. The hands know no more than eyes would tell them: where the tool is
 and what the windows say, read from `--status` and from the annotator's journal; and where the
 object stands. Each stage is a function and a line in `STAGES`; they leave what a person's work
@@ -43,7 +43,7 @@ from sart_toolkit.testing.desktop import Desktop
 _SART = (sys.executable, "-c", "from sart_toolkit.cli import main; main()")
 # Slow within this [m] of where the hand is heading, and how long [s] it takes to react.
 _NEAR, _REACTION = 0.06, 0.2
-# Between the legs of the way a person looks where they are.
+# Between plan steps a person checks where the tool is.
 _LOOK = 0.6
 # Keys of the annotator by their X names. By hand: a sphere at the start made larger in coarse
 # steps, then one at each convergence waypoint as far as there is room, save, leave.
@@ -101,7 +101,7 @@ def record(options: argparse.Namespace, images: Path) -> dict[str, Any]:
     with Desktop() as desktop:
         program = desktop.start(
             [*_SART, "record", name, "--out", str(out), "--device", "keyboard", "--overwrite",
-             "--operator", "machine hands", "--status", str(status)]
+             "--operator", "scripted input", "--status", str(status)]
         )  # fmt: skip
         desktop.window(f"sart record {name}")
         hands = _Hands(desktop, program, status, views(model, task.scene).R_world_hand)
@@ -109,8 +109,8 @@ def record(options: argparse.Namespace, images: Path) -> dict[str, Any]:
         time.sleep(_LOOK)
         desktop.screenshot(images / "record_ready.png")
         desktop.key("Right")
-        for leg in task.plan(task.initial_state(model, Placement())):
-            hands.steer(leg)
+        for step in task.plan(task.initial_state(model, Placement())):
+            hands.steer(step)
             if hands.look()["state"] == "recording":
                 desktop.screenshot(images / "record_recording.png")
         hands.see("state", "ended")
@@ -162,29 +162,29 @@ class _Hands:
             time.sleep(0.05)
         return now
 
-    def steer(self, leg: PlanStep, timeout_s: float = 60.0) -> None:
-        """Bring the tool to the end of a leg, or until the recording ends by itself."""
+    def steer(self, step: PlanStep, timeout_s: float = 60.0) -> None:
+        """Bring the tool to the end of a plan step, or until the recording ends by itself."""
         deadline = time.monotonic() + timeout_s
         while (now := self.look())["state"] != "ended":
             if time.monotonic() > deadline:
                 raise TimeoutError(f"the tool did not get there: {now['notice']}")
             if now["state"] == "recording":
-                self._close_or_open(now["gripper"], leg.gripper)
-                speed, wanted = self._keys(np.array(now["T_world_tool"]), leg)
+                self._close_or_open(now["gripper"], step.gripper)
+                speed, wanted = self._keys(np.array(now["T_world_tool"]), step)
                 self._choose_speed(speed)
                 self._hold(wanted)
                 if not wanted:
                     break
             time.sleep(0.03)
         self._hold(set())
-        time.sleep(_LOOK + leg.pause)
+        time.sleep(_LOOK + step.pause)
 
-    def _keys(self, T_world_tool: Array, leg: PlanStep) -> tuple[str, set[str]]:
-        """The speed to choose and the keys to hold, so as to come nearer to the end of a leg."""
-        motion = relative_motion(T_world_tool, leg.T_world_tool)
+    def _keys(self, T_world_tool: Array, step: PlanStep) -> tuple[str, set[str]]:
+        """The speed to choose and the keys to hold, to come nearer to the end of a plan step."""
+        motion = relative_motion(T_world_tool, step.T_world_tool)
         R_hand_tool = self._R_world_hand.T @ T_world_tool[:3, :3]
         left = np.concatenate([R_hand_tool @ motion[:3], R_hand_tool @ motion[3:]])
-        careful = leg.speed < 0.04 or float(np.abs(left[:3]).max()) < _NEAR
+        careful = step.speed < 0.04 or float(np.abs(left[:3]).max()) < _NEAR
         speed = SPEEDS[0] if careful else SPEEDS[1]
         # Let go a reaction's way before the end.
         reach = _REACTION * np.repeat([speed.linear, np.deg2rad(speed.turn_deg)], 3)
@@ -201,8 +201,8 @@ class _Hands:
             self._desktop.key(key)
             self._speed = key
 
-    def _close_or_open(self, told: float, wanted: float) -> None:
-        if (told > 0.5) != (wanted > 0.5) and wanted != self._gripper:
+    def _close_or_open(self, commanded: float, wanted: float) -> None:
+        if (commanded > 0.5) != (wanted > 0.5) and wanted != self._gripper:
             self._desktop.key("space")
             self._gripper = wanted
 

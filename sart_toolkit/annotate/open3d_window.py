@@ -166,7 +166,7 @@ class AnnotationWindow:
         self._moving = False
         self._last_key = self._last_close = 0.0
         self._resets = session.view_resets
-        self._looks: dict[int, tuple[Word, bool]] = {}
+        self._drawn: dict[int, tuple[Word, bool]] = {}
         self._ghost_gripper: float | None = None
         self._labels: list[Any] = []
         self._panel = _Panel(self._window, session, mono, small)
@@ -284,7 +284,7 @@ class AnnotationWindow:
 
     def _draw_spheres(self) -> None:
         session, scene = self._session, self._view.scene
-        for i in range(max(len(session.spheres), len(self._looks))):
+        for i in range(max(len(session.spheres), len(self._drawn))):
             ball, rings = f"sphere {i}", f"rings {i}"
             if i >= len(session.spheres):
                 scene.show_geometry(ball, False)
@@ -292,15 +292,15 @@ class AnnotationWindow:
                 continue
             sphere = session.spheres[i]
             # Glass is dear on a CPU: only the sphere at hand is made of it.
-            look = session.verdict(sphere).word, sphere is session.governing
-            if self._looks.get(i) != look:
-                colour, glass = _COLOURS[look[0]], look[1]
+            style = session.verdict(sphere).word, sphere is session.governing
+            if self._drawn.get(i) != style:
+                colour, glass = _COLOURS[style[0]], style[1]
                 for name in (ball, rings):
                     scene.remove_geometry(name)
                 if glass:
-                    scene.add_geometry(ball, _ball(1.0, colour), _glass(0.45))
+                    scene.add_geometry(ball, _ball(1.0, colour), _transparent(0.45))
                 scene.add_geometry(rings, _rings(colour), _line_material(2.5 if glass else 1.5))
-                self._looks[i] = look
+                self._drawn[i] = style
             T = np.diag([*[sphere.radius] * 3, 1.0])
             T[:3, 3] = sphere.T_world_key[:3, 3]
             for name in (ball, rings):
@@ -351,7 +351,7 @@ class AnnotationWindow:
             tool = _textured(tool)
             for i in range(self._session.config.ghosts):
                 scene.remove_geometry(f"ghost {i}")
-                scene.add_geometry(f"ghost {i}", tool, _glass(0.25))
+                scene.add_geometry(f"ghost {i}", tool, _transparent(0.25))
             self._ghost_gripper = gripper
         for i, T in enumerate(self._session.ghosts(sphere)):
             scene.show_geometry(f"ghost {i}", True)
@@ -493,7 +493,7 @@ def _image(rgb: Image, size: int) -> Any:
     return open3d.geometry.Image(pixels)
 
 
-def _glass(alpha: float) -> Any:
+def _transparent(alpha: float) -> Any:
     """For meshes with colours of their own."""
     material = rendering.MaterialRecord()
     material.shader = "defaultLitTransparency"

@@ -89,7 +89,7 @@ def augment_sources(
 ) -> Dataset:
     """Generate a dataset directory from demonstrations of one task and their annotations.
 
-    The spheres of all demonstrations share the trajectories that are wanted. Neither the number of
+    The trajectories are allocated to the spheres of all demonstrations. Neither the number of
     workers nor an interruption changes what is generated: called again with the same arguments it
     resumes.
 

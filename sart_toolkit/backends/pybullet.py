@@ -125,7 +125,7 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
         self._target = self._last_target = np.zeros(n + 1)
         # Another world with the same in it, where states are drawn.
         self._stage: PyBulletBackend | None = None
-        # The bytes restored last, until something changes: Bullet numbers contacts anew each time.
+        # The bytes restored last, until something changes: Bullet renumbers contacts each time.
         self._restored: bytes | None = None
 
     def _load_bodies(self, root: Body) -> None:
@@ -391,7 +391,7 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
         head, world = unpack_state(
             self.name, state, self.robot.name, self._scene_digest, sorted(self._bodies)
         )
-        # Contacts that are there already would keep forces that the file doesn't have.
+        # Existing contacts would keep forces that the file doesn't have.
         self._forget_contacts()
         handle, path = tempfile.mkstemp(suffix=".bullet")
         try:

@@ -117,7 +117,7 @@ class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, D
     friction between two bodies is the mean of their coefficients.
 
     PhysX remembers contacts in ways that can't be saved. So every `reset` and `restore` builds the
-    physics anew, and what follows depends on the state alone, to the bit; but the motion after a
+    physics, and what follows depends on the state alone, to the bit; but the motion after a
     `save` and the one after its `restore` may differ by `drift`.
 
     Physics needs no graphics. Where SAPIEN can't draw, `no_images` of the instance says why, and
@@ -177,7 +177,7 @@ class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, D
         )
 
     def _start(self, moment: _Moment, target: Array) -> None:
-        """Build the physics anew with everything as it is at a moment, and time 0."""
+        """Rebuild the physics with everything as it is at a moment, and time 0."""
         self._now = moment
         self._physics = _Physics(self._robot, self.scene, moment, self.rates.physics_hz)
         self._target = self._last_target = target

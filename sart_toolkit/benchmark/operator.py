@@ -83,7 +83,7 @@ def benchmark_operator(
     """Success rates of the scripted operator over random placements, cell by cell, without cameras.
 
     An episode succeeds when the goal is reached at its end and has been for the task's `hold`.
-    Finished episodes are kept beside `out` until all are done: interrupted, it goes on there.
+    Finished episodes are kept beside `out` until all are done: interrupted, it resumes there.
 
     Args:
         cells: tasks on backends.

@@ -25,7 +25,7 @@ def benchmark_replay(
 
     For each task a demonstration is recorded on each of its backends and replayed on the others.
     Rows tell the greatest difference of the measured tool poses over all recorded steps at which
-    neither run's robot, or what it carries, touched anything else.
+    neither run's robot, or what it grasps, touched anything else.
 
     Args:
         cells: tasks on backends.

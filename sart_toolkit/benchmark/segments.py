@@ -37,7 +37,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.workers import worker_map
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
-# Rounding lets a law that just fills a limit exceed it by less than this share.
+# Rounding lets a timing that just meets a limit exceed it by less than this fraction.
 _ROUNDING = 1e-9
 
 
@@ -103,7 +103,7 @@ def _tool_points(model: RobotModel, configurations: Array) -> Array:
 
 
 class _Segments:
-    """Makes tries of a cell; keeps the last cell's backend, demonstration and spheres."""
+    """Makes attempts of a cell; keeps the last cell's backend, demonstration and spheres."""
 
     def __init__(self, cells: Sequence[Cell], config: SegmentsConfig) -> None:
         self._cells = {cell.name: cell for cell in cells}
@@ -139,7 +139,7 @@ class _Segments:
         motion: Motion | None = None
         row: dict[str, Any] = {
             "cell": name,
-            "try": number,
+            "attempt": number,
             "sphere": at,
             "k": k,
             "waypoint": sphere.waypoint,
@@ -198,17 +198,17 @@ def benchmark_segments(
 
     Args:
         cells: tasks on backends.
-        config: how many tries.
+        config: how many attempts.
         out: JSON file to write.
         workers: processes.
-        overwrite: replace `out`, and forget finished tries.
-        progress: called with (done, wanted, kept) after each try.
+        overwrite: replace `out`, and forget finished attempts.
+        progress: called with (done, wanted, kept) after each attempt.
         about: what else is to stand in the file, such as the command.
 
     Raises:
         OutputExists: `out` is there and `overwrite` is false.
         Mismatch: it was interrupted with another seed or obstacles, or a demonstration failed.
-        InvalidInput: there are fewer tries than cells.
+        InvalidInput: there are fewer attempts than cells.
         MissingCapability: a backend can't restore states.
         CannotWrite: the disk refuses.
     """
@@ -218,7 +218,7 @@ def benchmark_segments(
     wanted = [(cell.name, i) for n, cell in enumerate(cells) for i in range(share + (n < rest))]
     asked = {"benchmark": "segments", "seed": config.seed, "obstacles": config.obstacles}
     log = ResultLog(out, asked, overwrite)
-    rows = {(row["cell"], row["try"]): row for row in log.rows}
+    rows = {(row["cell"], row["attempt"]): row for row in log.rows}
     missing = [item for item in wanted if item not in rows]
     done = len(wanted) - len(missing)
     kept = sum(rows[item]["outcome"] == KEPT for item in wanted if item in rows)

@@ -62,7 +62,9 @@ _EVAL_SEED = Annotated[int, arg(help="Seed of the placements, apart from trainin
 _YAW = Annotated[
     float, arg(help="Also turn the object, uniformly within ± this [deg]; the paper does not.")
 ]
-_LOOKS = Annotated[bool, arg(help="Vary colours, light and the wrist camera's mounting at random.")]
+_APPEARANCE = Annotated[
+    bool, arg(help="Vary colours, light and the wrist camera's mounting at random.")
+]
 _TASKS = Annotated[str, arg(help="Names of tasks with commas between, or all.")]
 _BACKENDS = Annotated[str, arg(help="Names of backends with commas between, or all.")]
 _SLIP_TOLERANCE = Annotated[
@@ -162,7 +164,7 @@ class Record:
         Literal["middle", "random"], arg(help="Where the object stands in its range.")
     ] = "middle"
     yaw_deg: _YAW = 0.0
-    vary_looks: _LOOKS = False
+    vary_appearance: _APPEARANCE = False
     image_size: _IMAGE = "128"
     cameras: _CAMERAS = "wrist"
     overwrite: _OVERWRITE = False
@@ -297,7 +299,7 @@ class Augment:
     strategy: _STRATEGY = "sart"
     allocation: Annotated[
         Literal["radius", "equal"],
-        arg(help="How spheres share the trajectories: by their radii, or equally as in the paper."),
+        arg(help="Allocation of trajectories to spheres: by radius, or equally as in the paper."),
     ] = "radius"
     distribution: _DISTRIBUTION = "paper"
     rotation_per_metre: Annotated[
@@ -391,11 +393,11 @@ class Train:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Try a skill on random placements.
+    """Evaluate a skill on random placements.
 
     Example: sart evaluate skill --out evaluation.json --episodes 100 --workers 2
 
-    Example: sart evaluate skill --out looks.json --vary-looks --yaw-deg 15
+    Example: sart evaluate skill --out varied.json --vary-appearance --yaw-deg 15
     """
 
     skill: Annotated[Positional[Path], arg(metavar="SKILL", help="Directory from `sart train`.")]
@@ -406,7 +408,7 @@ class Evaluate:
     episodes: _EPISODES = 50
     eval_seed: _EVAL_SEED = 1000
     yaw_deg: _YAW = 0.0
-    vary_looks: _LOOKS = False
+    vary_appearance: _APPEARANCE = False
     videos: Annotated[int, arg(help="Videos of the first successes, and as many of failures.")] = 2
     workers: _WORKERS = 2
     device: _DEVICE = "cpu"
@@ -469,7 +471,9 @@ class BenchmarkSegments:
 
     tasks: _TASKS = "all"
     backends: _BACKENDS = "all"
-    count: Annotated[int, arg(help="Segments to try, shared by tasks and backends.")] = 10_000
+    count: Annotated[int, arg(help="Segments to attempt, divided among tasks and backends.")] = (
+        10_000
+    )
     source: _SOURCE = "scene"
     seed: _SEED = 0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_segments.json")
@@ -584,6 +588,6 @@ class Doctor:
     """
 
     full: Annotated[
-        bool, arg(help="Also try out torch, SAPIEN, windows and devices, which takes longer.")
+        bool, arg(help="Also test torch, SAPIEN, windows and devices, which takes longer.")
     ] = False
     json: _JSON = False

@@ -34,7 +34,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape
 from sart_toolkit.scenes.spec import SceneSpec
 
-# An image looks through a point when all it sees around it lies farther by this.
+# An image sees through a point when everything around it is farther by this.
 _THROUGH_VOXELS, _THROUGH_SHARE = 2.0, 0.03
 # Between two images used the camera has moved or turned by at least this [m, rad].
 _STEP, _TURN = 0.02, np.deg2rad(6.0)
@@ -53,7 +53,7 @@ class CloudConfig:
     robot's convex parts are its own pixels.
 
     `unknown` is the rule for space that no image shows: "free", or "behind": solid to a depth of
-    `behind` along the ray behind what was seen, except where an image looks through it or the
+    `behind` along the ray behind what was seen, except where an image sees through it or the
     robot itself was.
 
     `inflation`: every point stands for a ball of this radius, for what lies between pixels. It is
@@ -259,7 +259,7 @@ class _View:
         return ahead[inside], uv[inside, 1] * width + uv[inside, 0], p[inside, 2]
 
     def through(self, p_world: Array, voxel: float) -> NDArray[np.bool_]:
-        """Which points `(n, 3)` the image looks through: all it sees there lies behind them."""
+        """Which points `(n, 3)` the image sees through: all it sees there lies behind them."""
         rows, pixels, z = self.project(p_world)
         result = np.zeros(len(p_world), dtype=bool)
         result[rows] = self.nearest.ravel()[pixels] > z + _tolerance(z, voxel)
@@ -294,7 +294,7 @@ def fuse_cloud(
     """The coloured point cloud of the scene that the wrist images at some waypoints show.
 
     Images are chosen by how far the camera has moved. The robot's own pixels and those of what
-    it grasped are dropped, and points that a later image looks through: what was there has
+    it grasped are dropped, and points that a later image sees through: what was there has
     moved, or was noise.
 
     Args:
@@ -436,7 +436,7 @@ def _merged(pixels: _Pixels, views: Sequence[_View], config: CloudConfig) -> _Ce
 
 
 def _moved_away(cells: _Cells, views: Sequence[_View], config: CloudConfig) -> NDArray[np.bool_]:
-    """Which cells `(n,)` a later image looks through."""
+    """Which cells `(n,)` a later image sees through."""
     gone = np.zeros(len(cells.points), dtype=bool)
     for view in views:
         rows = np.flatnonzero(~gone & (cells.last < view.waypoint))
@@ -454,7 +454,7 @@ def _filled(
 ) -> tuple[Array, NDArray[np.int64]]:
     """The outer layer of what lies hidden behind the kept cells, and which cell each is behind.
 
-    Cells that an image looks through, or where the robot was itself, aren't hidden.
+    Cells that an image sees through, or where the robot was itself, aren't hidden.
     """
     seen = cells.numbers[keep]
     row = np.searchsorted(cells.numbers, pixels.cell)
@@ -517,9 +517,9 @@ class _MeanMisfit:
         self._sum, self._count = np.zeros(n), np.zeros(n)
 
     def add(self, misfits: Array) -> None:
-        told = np.isfinite(misfits)
-        self._sum[told] += misfits[told]
-        self._count[told] += 1
+        measured = np.isfinite(misfits)
+        self._sum[measured] += misfits[measured]
+        self._count[measured] += 1
 
     def mean(self) -> Array:
         """The means `(n,)` [m], infinite where no image tells."""
@@ -537,7 +537,7 @@ def grasped_object(
     """What the gripper took away, as points in the tool frame; None if it took nothing.
 
     Of the points near the tool those belong to it that rode along with the tool in the images of
-    `after`, and those seen in `before` that images of `after` look through. Without `before`
+    `after`, and those seen in `before` that images of `after` see through. Without `before`
     only the side towards the camera is known; it is then taken to be `config.behind` deep, away
     from the camera and across the tool's axis (unless `config.unknown` is "free").
 

@@ -52,13 +52,13 @@ class CloudWorld(CollisionWorld):
         slip_tolerance: float = IN_GRASP_SLIP,
         config: CloudConfig | None = None,
     ) -> None:
-        """Take the images of a demonstration; they are looked at when a waypoint is asked about.
+        """Take the images of a demonstration; they are processed when a waypoint is asked about.
 
         Args:
             demonstration: what was shown and seen.
             robot: the robot that was steered.
             scene: tells what is fixed to the robot and which bodies can be lifted; where its bodies
-                are and what shape they have is not looked at.
+                are and what shape they have is not used.
             slip_tolerance: how far [m] what is grasped may move in the grasp.
             config: how images become a cloud.
 
@@ -69,7 +69,7 @@ class CloudWorld(CollisionWorld):
         self._robot, self._held = robot, scene.held
         self._config = config or CloudConfig()
         self._collision = CollisionModel(robot, SceneSpec((), scene.held))
-        self._looked: dict[range, _Seen] = {}
+        self._runs_seen: dict[range, _Seen] = {}
         self._shapes: dict[range, GraspedObject | None] = {}
         self._placed: dict[int, PlacedModel] = {}
 
@@ -119,11 +119,11 @@ class CloudWorld(CollisionWorld):
 
     def _seen(self, run: range) -> _Seen:
         """What the images of a run of waypoints show."""
-        if run not in self._looked:
-            self._looked[run] = self._look(run)
-        return self._looked[run]
+        if run not in self._runs_seen:
+            self._runs_seen[run] = self._process(run)
+        return self._runs_seen[run]
 
-    def _look(self, run: range) -> _Seen:
+    def _process(self, run: range) -> _Seen:
         grasped = self._own_shape(run)
         if grasped is None:
             others = (o for o in self._same_grasp(run) if self._own_shape(o) is not None)

@@ -120,7 +120,7 @@ def make_world(
             recorded RGB-D.
         demonstration: what was shown.
         robot: the robot that was steered.
-        scene: the task's scene; of "cloud", only what is fixed to the robot is looked at, and the
+        scene: the task's scene; of "cloud", only what is fixed to the robot is used, and the
             names of the bodies that can be lifted.
         slip_tolerance: how far [m] a grasped object may move in the grasp.
         cloud: how images become a cloud.

@@ -55,7 +55,7 @@ def _cannot_write(path: Path) -> Iterator[None]:
         raise
     except PermissionError as error:
         raise CannotWrite(
-            f"{path}: permission denied; choose another --out or mend its permissions"
+            f"{path}: permission denied; choose another --out or fix its permissions"
         ) from error
     except OSError as error:
         raise CannotWrite(
@@ -128,7 +128,7 @@ def read_json(path: Path) -> dict[str, Any]:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise BrokenFile(
-            f"{path}: not readable as JSON ({error}); mend or make it again"
+            f"{path}: not readable as JSON ({error}); fix it or make it again"
         ) from error
     except OSError as error:
         raise BrokenFile(f"{path}: {error.strerror}; check the path and its permissions") from error

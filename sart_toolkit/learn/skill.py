@@ -38,7 +38,7 @@ from sart_toolkit.poses import Array, check_array, check_pose, frozen
 
 _T = TypeVar("_T")
 
-# A gripper that is told to open and to close knows two; more stand for a finger on a trigger.
+# A gripper commanded to open and close takes two values; more mean an analogue trigger.
 _FEW_GRIPPER_COMMANDS = 4
 
 

@@ -1,4 +1,4 @@
-"""A person's recording, without its window: what each control does, and what the person is told."""
+"""A person's recording, without its window: what each control does, and the messages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sart_toolkit.errors import DeviceLost, SartError
 from sart_toolkit.record.devices.manual import Control, ManualDevice
 from sart_toolkit.record.session import End, SessionState, TeleopSession
 
-# More than this [N] is a hard press, which a person should be told of before all else.
+# More than this [N] is a hard press, which a person should be warned of before all else.
 FIRM = 50.0
 # So much [s] may be thrown away without being asked again.
 _SOON_DONE_AGAIN = 3.0
@@ -52,7 +52,7 @@ class RecordingDesk:
         Args:
             session: the recording.
             device: what the person steers with, connected.
-            save: writes a demonstration; if it raises a `SartError` it can be tried again.
+            save: writes a demonstration; if it raises a `SartError` saving can be attempted again.
             watch: called with JSON values after each recorded step and each change of state.
         """
         self.session, self.device = session, device
@@ -74,7 +74,7 @@ class RecordingDesk:
             case SessionState.READY:
                 return Notice("This is the start. Press → to record.")
             case SessionState.PAUSED:
-                return Notice("Paused. Press → to go on.")
+                return Notice("Paused. Press → to resume.")
             case SessionState.ENDED:
                 return self._ended_notice()
             case SessionState.SAVED:
@@ -121,7 +121,7 @@ class RecordingDesk:
         except DeviceLost as error:
             # While nothing is recorded it may come back by itself, or at the next →.
             if session.state is SessionState.RECORDING:
-                self._pause(f"Paused: {error}. Plug it in and press → to go on; nothing is lost.")
+                self._pause(f"Paused: {error}. Plug it in and press → to resume; nothing is lost.")
             return
         for control in self.device.controls():
             self.press(control)
@@ -190,10 +190,10 @@ class RecordingDesk:
             return
         if session.state is SessionState.RECORDING:
             session.pause()
-        goes_on = "→ saves it" if session.state is SessionState.ENDED else "→ goes on"
+        resumes = "→ saves it" if session.state is SessionState.ENDED else "→ resumes"
         self._ask(
             Control.DISCARD,
-            f"Esc again throws {session.seconds:.0f} s of recording away; {goes_on}.",
+            f"Esc again throws {session.seconds:.0f} s of recording away; {resumes}.",
         )
 
     def _ask(self, control: Control, question: str) -> None:

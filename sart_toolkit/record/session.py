@@ -155,8 +155,8 @@ class TeleopSession:
         end: why it ended, once it has.
         gripper: the gripper command in force, in [0, 1].
         trouble: why the last command was not carried out; empty where it was.
-        contacts: what the robot, or what it carries, touched in the last control period, but for
-            what it carries itself; the firmest first.
+        contacts: what the robot, or what it grasps, touched in the last control period, but for
+            what it grasps itself; the firmest first.
     """
 
     def __init__(
@@ -283,10 +283,10 @@ class TeleopSession:
     # --- what a person does ---------------------------------------------------------------------
 
     def start(self) -> None:
-        """Begin to record, or go on after a pause.
+        """Begin to record, or resume after a pause.
 
         Raises:
-            InvalidInput: there is nothing to start or go on with.
+            InvalidInput: there is nothing to start or resume.
         """
         self._expect("start", SessionState.READY, SessionState.PAUSED)
         if self._started_at is None:
@@ -437,11 +437,11 @@ class TeleopSession:
             return f"joint limit: {self.model.spec.arm_joints[joint]}"
         return "joints would jump" if isinstance(error, MotionRejected) else "out of reach"
 
-    def _outer(self, felt: list[Contact]) -> list[Contact]:
-        scene, pairs = self.task.scene, {(contact.a, contact.b) for contact in felt}
+    def _outer(self, contacts: list[Contact]) -> list[Contact]:
+        scene, pairs = self.task.scene, {(contact.a, contact.b) for contact in contacts}
         grasped = scene.grasped(pairs, self.model.spec.gripper.finger_links)
         outer = scene.outer_contacts(pairs, grasped)
-        return sorted((c for c in felt if (c.a, c.b) in outer), key=lambda c: -c.force)
+        return sorted((c for c in contacts if (c.a, c.b) in outer), key=lambda c: -c.force)
 
     # --- the result -----------------------------------------------------------------------------
 

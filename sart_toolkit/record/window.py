@@ -40,7 +40,7 @@ _TONES: dict[Tone, str] = {"plain": LINE, "good": GREEN, "warning": ORANGE, "bad
 _MEANINGS = {
     SessionState.READY: ("start", "start again", "close"),
     SessionState.RECORDING: ("end", "start again", "discard"),
-    SessionState.PAUSED: ("go on", "start again", "discard"),
+    SessionState.PAUSED: ("resume", "start again", "discard"),
     SessionState.ENDED: ("save", "record again", "discard"),
     SessionState.SAVED: ("close", "", ""),
 }
@@ -215,8 +215,8 @@ class RecordingWindow:
         screen.text((left, 344), "Gripper (Space)", 14, FAINT)
         screen.bar((left, 370, 168, 10), session.observation.gripper, BLUE)
         # While nothing moves, what the hand has asked for in the meantime.
-        told = "open" if device.gripper < 0.5 else "closed"
-        screen.text((left, 388), f"told: {told}", 15)
+        commanded = "open" if device.gripper < 0.5 else "closed"
+        screen.text((left, 388), f"commanded: {commanded}", 15)
 
     def _notice(self) -> None:
         notice = self._desk.notice

@@ -126,7 +126,7 @@ class SceneView:
     """Draws the scene from outside as it was at each step, from recorded joints and bodies.
 
     Through an episode's segment the bodies are where the demonstration had them at the waypoint
-    that it joins, and what is carried moves with the tool.
+    that it joins, and what is grasped moves with the tool.
     """
 
     def __init__(self, playback: Playback, backend: Backend, camera: str) -> None:
@@ -190,9 +190,9 @@ def _large(frame: Image) -> Image:
 
 def _facts(playback: Playback, i: int) -> str:
     force = playback.force(i)
-    felt = "" if np.isnan(force) else f" · {force:.0f} N"
+    force_text = "" if np.isnan(force) else f" · {force:.0f} N"
     reached = " · goal reached" if playback.success(i) else ""
-    return f"{playback.part(i)} · gripper {playback.gripper(i)[0]:.2f}{felt}{reached}"
+    return f"{playback.part(i)} · gripper {playback.gripper(i)[0]:.2f}{force_text}{reached}"
 
 
 class PlayWindow:
@@ -269,7 +269,7 @@ class PlayWindow:
                 self.closed = True
 
     def step(self, by: int) -> None:
-        """Go on, or back, by a number of steps, as far as there are any."""
+        """Go forward, or back, by a number of steps, as far as there are any."""
         last = len(self._playback) - 1
         self.at = min(max(self.at + by, 0), last)
         if self.playing and self.at == last:
@@ -309,7 +309,7 @@ class PlayWindow:
         self._fact(140, "Step", f"{i + 1} of {len(playback)}")
         self._fact(196, "From the", playback.part(i))
         self._fact(252, "Waypoint", str(playback.waypoint(i)) if i >= playback.split else "–")
-        self._fact(308, "Gripper, told", f"{measured:.2f}, {commanded:.2f}")
+        self._fact(308, "Gripper, commanded", f"{measured:.2f}, {commanded:.2f}")
         words = "not measured" if np.isnan(force) else f"{force:.0f} N"
         self._fact(364, "Contact force", words, ORANGE if force > 0 else TEXT)
         reached = playback.success(i)

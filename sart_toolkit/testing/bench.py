@@ -247,7 +247,7 @@ class Bench:
     # --- what is compared -----------------------------------------------------------------------
 
     def digest(self, images: bool = False) -> str:
-        """What is observed now but the time, to the bit; the first camera's image if told."""
+        """What is observed now but the time, to the bit; the first camera's image if asked for."""
         shown = images and not self.backend.no_images and self.takes_images()
         return _digest(self.see(tuple(self.backend.cameras)[:1] if shown else (), 32))
 

@@ -87,7 +87,7 @@ def view(_in_scene: Callable[[str], Bench]) -> Bench:
 
 @pytest.fixture
 def another(bench: Bench) -> Iterator[Make]:
-    """Makes fresh benches of the same backend and robot, in the same scene or in one told."""
+    """Makes fresh benches of the same backend and robot, in the same scene or in a given one."""
     made: list[Bench] = []
 
     def make(scene: SceneSpec | None = None) -> Bench:

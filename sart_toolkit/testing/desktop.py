@@ -1,4 +1,4 @@
-"""A screen that nobody looks at, with hands: windows under Xvfb, keys by xdotool, images of it.
+"""A virtual screen, with hands: windows under Xvfb, keys by xdotool, images of it.
 
 For tests of windows and for the programs that make the documentation's images.
 """

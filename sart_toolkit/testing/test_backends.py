@@ -90,7 +90,7 @@ def test_two_instances_do_the_same(bench: Bench, another: Make) -> None:
 
 
 def test_two_instances_are_independent(bench: Bench, another: Make) -> None:
-    """What one is told and does, the other doesn't notice."""
+    """What one is commanded and does, the other doesn't notice."""
     bench.relies_on_repeating()
     expected = bench.continuation()
     bench.reset()

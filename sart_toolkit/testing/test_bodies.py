@@ -259,7 +259,7 @@ def test_a_detent_pushes_out_from_its_farther_half(jointed: Bench, kind: str) ->
     assert path.max() > detent.position + detent.width, "it is not pushed out"
     outside = detent.position + 1.2 * detent.width
     path = _path(jointed, f"caught_{kind}", outside, 0.3)
-    assert np.abs(path - outside).max() < 1e-3, "it is felt beyond its width"
+    assert np.abs(path - outside).max() < 1e-3, "it acts beyond its width"
 
 
 def test_the_tool_pushes_a_jointed_body(jointed: Bench) -> None:

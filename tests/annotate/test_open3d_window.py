@@ -65,7 +65,7 @@ def test_every_key_does_in_the_window_what_the_table_says(
     screen.key("Home")
     wait_until(lambda: screen.screenshot().tobytes() != before, 60)
 
-    # What a killed window has done is gone on with by the next one.
+    # The next window continues what a killed one has done.
     n = len(rows(tmp_path)) - 1
     program.kill()
     program.wait()
@@ -99,7 +99,7 @@ def test_ctrl_c_closes_the_window_and_keeps_the_work(
     program.send_signal(signal.SIGINT)
     _, err = program.communicate(timeout=60)
     assert program.returncode == 130, err
-    assert "type the same command again to go on" in err
+    assert "type the same command again to resume" in err
     assert len(rows(tmp_path)) == 3
 
 
@@ -108,7 +108,7 @@ def test_every_key_has_a_number_of_open3d(window_module):
     assert set(window_module._KEY_NAMES.values()) == set(KEYS) - {"Escape"}
 
 
-def test_without_open3d_the_remedy_is_told(monkeypatch):
+def test_without_open3d_the_remedy_is_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     monkeypatch.delitem(sys.modules, "sart_toolkit.annotate.open3d_window", raising=False)
     with pytest.raises(MissingExtra, match=r"pip install sart_toolkit\[annotate\].*--no-window"):

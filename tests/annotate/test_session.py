@@ -299,7 +299,7 @@ def test_numbers_choose_a_waypoint_and_a_radius(session):
     assert rows(session.spheres)[0][:2] == (7, 0.0125)
 
 
-def test_an_unknown_key_or_action_is_told(session):
+def test_an_unknown_key_or_action_is_reported(session):
     assert not session.press("F1") and session.presses == 0
     with pytest.raises(UnknownName, match="unknown action 'suggestall': did you mean 'suggest-all"):
         session.perform("suggestall")

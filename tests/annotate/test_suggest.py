@@ -165,7 +165,7 @@ def test_what_limits_a_radius_is_a_pair_at_the_stated_clearance(
 def test_every_pose_that_augmentation_draws_keeps_the_whole_robot_clear(
     peg_demonstration, peg_world, peg_annotation
 ):
-    """Monte Carlo by the paper's law, on each sphere and inside it."""
+    """Monte Carlo by the paper's distribution, on each sphere and inside it."""
     rng = np.random.default_rng(0)
     margin = SuggestConfig().margin
     for sphere in peg_annotation.spheres:

@@ -280,7 +280,7 @@ def test_a_line_too_fast_for_the_joints_takes_longer_and_the_episode_says_so(
         assert len(episode) == round(10 * duration)
 
 
-def test_a_start_in_collision_is_told_with_the_pair_and_by_how_much(
+def test_a_start_in_collision_is_reported_with_the_pair_and_by_how_much(
     peg_demonstration, peg_task, peg_backend, augment, annotate, tmp_path
 ):
     """The block stands where the peg is when the segment starts."""

@@ -48,7 +48,7 @@ def demo(task, model, backend):
 
 
 @pytest.fixture(scope="module")
-def carried_at(task, model, demo):
+def grasped_at(task, model, demo):
     fingers = model.spec.gripper.finger_links
     return [task.scene.grasped(touching, fingers) for touching in demo.touching]
 
@@ -68,10 +68,10 @@ def sphere_at(demo, t, radius):
     return Annotation((sphere,), demo.content_hash())
 
 
-def test_a_demonstration_keeps_what_touched_and_so_when_it_was_grasped(demo, carried_at, tmp_path):
-    first = carried_at.index({"toolbox"})
+def test_a_demonstration_keeps_what_touched_and_so_when_it_was_grasped(demo, grasped_at, tmp_path):
+    first = grasped_at.index({"toolbox"})
     assert 10 < first < len(demo) - 10
-    assert all(carried == {"toolbox"} for carried in carried_at[first + 1 :])
+    assert all(grasped == {"toolbox"} for grasped in grasped_at[first + 1 :])
     assert ("table", "toolbox") in demo.touching[1]
     assert ("table", "toolbox") not in demo.touching[-1]
     save_demonstration(tmp_path / "demo.h5", demo)
@@ -81,19 +81,19 @@ def test_a_demonstration_keeps_what_touched_and_so_when_it_was_grasped(demo, car
 
 
 def test_every_sphere_rejoins_before_the_gripper_or_a_contact_changes(
-    task, demo, carried_at, annotation
+    task, demo, grasped_at, annotation
 ):
     commands = demo.steps.commanded_gripper
     for sphere in annotation.spheres:
         t, t_star = sphere.waypoint, convergence_waypoint(demo, sphere)
         assert len(set(np.round(commands[t : t_star + 1], 2))) == 1
-        assert len(set(carried_at[t : t_star + 1])) == 1
+        assert len(set(grasped_at[t : t_star + 1])) == 1
         for s in range(t, t_star + 1):
-            assert not task.scene.outer_contacts(demo.touching[s], carried_at[s])
+            assert not task.scene.outer_contacts(demo.touching[s], grasped_at[s])
 
 
-def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, carried_at):
-    carrying = [bool(carried_at[sphere.waypoint]) for sphere in annotation.spheres]
+def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, grasped_at):
+    carrying = [bool(grasped_at[sphere.waypoint]) for sphere in annotation.spheres]
     assert not carrying[0] and carrying[-1]
     assert carrying == sorted(carrying)
     reasons = [sphere.limited_by for sphere in annotation.spheres]
@@ -102,10 +102,10 @@ def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, carrie
 
 
 def test_a_waypoint_in_a_contact_or_at_the_gripper_s_event_is_refused_with_that_reason(
-    demo, world, carried_at
+    demo, world, grasped_at
 ):
     closing = next(s for s in range(len(demo)) if demo.steps.commanded_gripper[s] > 0.5)
-    standing = carried_at.index({"toolbox"}) + 1
+    standing = grasped_at.index({"toolbox"}) + 1
     for t, reason in (
         (closing - 1, rf"\(gripper command at waypoint {closing}\)"),
         (standing, r"\(contact table / toolbox\)"),
@@ -115,7 +115,7 @@ def test_a_waypoint_in_a_contact_or_at_the_gripper_s_event_is_refused_with_that_
 
 
 def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(
-    backend, model, demo, annotation, carried_at
+    backend, model, demo, annotation, grasped_at
 ):
     config = AugmentConfig(n=8)
     i = len(annotation.spheres) - 1
@@ -128,7 +128,7 @@ def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(
 def test_a_try_with_an_object_in_the_grasp_does_not_depend_on_those_before(
     backend, demo, annotation
 ):
-    """Contacts that are there when a state is restored must leave nothing behind."""
+    """Contacts that exist when a state is restored must leave nothing behind."""
     make = RestoreExecutor(backend, [(demo, annotation)], AugmentConfig(n=8)).attempt
     i = len(annotation.spheres) - 1
     first = make(AttemptKey(0, i, 0))
@@ -139,10 +139,10 @@ def test_a_try_with_an_object_in_the_grasp_does_not_depend_on_those_before(
 
 
 def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
-    backend, model, demo, carried_at
+    backend, model, demo, grasped_at
 ):
     height = demo.body_Ts_world["toolbox"][:, 2, 3]
-    t = next(s for s in range(len(demo)) if carried_at[s] and height[s] > 0.012)
+    t = next(s for s in range(len(demo)) if grasped_at[s] and height[s] > 0.012)
     config = AugmentConfig(n=8)
     outcomes = {
         RestoreExecutor(backend, [(demo, sphere_at(demo, t, 0.04))], config)
@@ -162,7 +162,7 @@ def test_a_segment_on_which_the_object_slips_is_rejected(backend, demo, annotati
 
 
 def test_a_segment_on_which_the_open_fingers_touch_the_object_is_rejected(
-    backend, model, demo, carried_at
+    backend, model, demo, grasped_at
 ):
     t = next(s for s in range(len(demo)) if demo.steps.commanded_gripper[s] > 0.5) - 2
     config = AugmentConfig(n=8)

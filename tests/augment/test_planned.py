@@ -266,14 +266,14 @@ def test_two_processes_generate_the_same_as_one_and_it_holds_when_checked_again(
 # --- the image --------------------------------------------------------------------------------
 
 
-def test_the_image_is_drawn_and_its_counts_are_told(tmp_path, capsys):
+def test_the_image_is_drawn_and_its_counts_are_reported(tmp_path, capsys):
     pytest.importorskip("ompl")
     out = tmp_path / "images" / "planned.png"
     assert image.main(["--out", str(out), "--draws", "6"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["draws"] == 6 and "ompl" in told["versions"]
+    report = json.loads(capsys.readouterr().out)
+    assert report["draws"] == 6 and "ompl" in report["versions"]
     for name in ("sart", "sart_planned"):
-        assert told["kept"][name] + sum(told["rejected"][name].values()) == 6
+        assert report["kept"][name] + sum(report["rejected"][name].values()) == 6
     with Image.open(out) as drawn:
         assert drawn.width > 1000
 

@@ -99,7 +99,7 @@ def test_depth_is_that_of_a_ray_cast_to_a_fifth_of_a_millimetre(view, camera, si
     assert (difference > 2e-4).mean() < 0.02
 
 
-def test_an_ability_is_had_or_its_lack_is_told_with_the_purpose(limited):
+def test_an_ability_is_had_or_its_lack_is_reported_with_the_purpose(limited):
     backend = make_backend("pybullet", get_robot("ur5e_hande"), SceneSpec(()), 8)
     assert require(backend, Resets, "tests reset it") is backend
     core = limited(backend, Resets)

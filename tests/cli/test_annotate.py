@@ -158,7 +158,7 @@ def test_headless_nothing_is_replaced_unless_told(annotate, refused, demo):
     assert not demo.with_name("demo.annotation.json.journal").exists()
 
 
-def test_without_a_display_the_headless_way_is_told(refused, demo, monkeypatch):
+def test_without_a_display_the_headless_way_is_reported(refused, demo, monkeypatch):
     pytest.importorskip("open3d")
     monkeypatch.delenv("DISPLAY", raising=False)
     line = refused(demo)
@@ -183,13 +183,13 @@ def test_wrong_input_is_one_line_and_leaves_nothing(refused, demo, tmp_path, peg
     save_annotation(out, type(peg_annotation)(peg_annotation.spheres, "0" * 64, settings={}))
     before = out.read_bytes()
     line = refused(demo, "--text", "--out", out)
-    assert "another demonstration" in line and "begin anew with --overwrite" in line
+    assert "another demonstration" in line and "start again with --overwrite" in line
     assert out.read_bytes() == before
     assert sorted(os.listdir(tmp_path)) == ["demo.h5", "other.json"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_an_unwritable_place_is_told_before_anything_is_asked(refused, demo, tmp_path):
+def test_an_unwritable_place_is_reported_before_anything_is_asked(refused, demo, tmp_path):
     place = tmp_path / "place"
     place.mkdir(mode=0o500)
     assert "permission denied" in refused(demo, "--text", "--out", place / "a.json")

@@ -336,7 +336,7 @@ def test_placement_can_be_random(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert placement["x"] != 0.0 and abs(placement["x"]) <= 0.05
 
 
-def test_yaw_and_looks_vary_only_where_asked_for(
+def test_yaw_and_appearance_vary_only_where_asked_for(
     chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["record", "peg_in_hole", "--image-size", 32, "--out"]
@@ -346,7 +346,7 @@ def test_yaw_and_looks_vary_only_where_asked_for(
     assert "can be turned by 0 to" in error(
         capsys, *argv, tmp_path / "c.h5", "--placement", "random", "--yaw-deg", 90
     )
-    run(capsys, *argv, tmp_path / "d.h5", "--vary-looks")
+    run(capsys, *argv, tmp_path / "d.h5", "--vary-appearance")
     plain, varied = (load_demonstration(p) for p in (chain / "demo.h5", tmp_path / "d.h5"))
     assert (plain.raw_commands == varied.raw_commands).all()
     images = [d.steps.cameras["wrist"].rgb[0].astype(int) for d in (plain, varied)]

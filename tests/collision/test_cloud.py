@@ -173,7 +173,7 @@ def test_what_comes_later_is_in_the_cloud(rendered, robot):
     assert on_box(seen(fuse_cloud(comes, robot, ())), BOX).sum() > 30
 
 
-def test_a_noisy_pixel_that_other_images_look_through_is_dropped(rendered, robot):
+def test_a_noisy_pixel_that_other_images_see_through_is_dropped(rendered, robot):
     demonstration = rendered(lambda t: [])
     camera = demonstration.steps.cameras["wrist"]
     depth = np.array(camera.depth)
@@ -251,7 +251,7 @@ def from_two_sides(Ts):
     return np.stack([about @ T if t % 2 else T for t, T in enumerate(Ts)])
 
 
-def test_nothing_is_filled_in_where_another_image_looks_through(rendered, robot, way_down):
+def test_nothing_is_filled_in_where_another_image_sees_through(rendered, robot, way_down):
     demonstration = rendered(lambda t: [BOX], 96, from_two_sides(way_down))
 
     def shadow(waypoints):
@@ -284,7 +284,7 @@ def test_nothing_is_filled_in_where_the_robot_itself_was(rendered, robot, peg_ta
     assert in_peg([0, len(demonstration) - 1]) == 0
 
 
-# --- what is carried ----------------------------------------------------------------------------
+# --- what is grasped ----------------------------------------------------------------------------
 
 
 T_TOOL_BOX = pose([0.01, -0.03, 0.10])
@@ -326,7 +326,7 @@ def test_an_object_held_from_the_start_is_taken_to_be_as_deep_as_the_unknown(car
     np.testing.assert_allclose(shift[:, 2], 0, atol=1e-12)
 
 
-def test_what_was_taken_out_of_sight_is_found_where_images_look_through(rendered, robot, way_down):
+def test_what_was_taken_out_of_sight_is_found_where_images_see_through(rendered, robot, way_down):
     T_box = way_down[12] @ T_TOOL_BOX
     taken = rendered(lambda t: [T_box] if t < 12 else [])
     found = grasped_object(taken, robot, (), range(12, len(taken)), range(12))
@@ -334,7 +334,7 @@ def test_what_was_taken_out_of_sight_is_found_where_images_look_through(rendered
     assert on_box(found.points, T_TOOL_BOX).all()
 
 
-def test_nothing_is_carried_where_all_stays_or_the_tool_does_not_move(rendered, carrying, robot):
+def test_nothing_is_grasped_where_all_stays_or_the_tool_does_not_move(rendered, carrying, robot):
     still = rendered(lambda t: [BOX])
     assert grasped_object(still, robot, (), range(12, len(still)), range(12)) is None
     assert grasped_object(carrying, robot, (), range(12, 13), range(12)) is None
@@ -453,7 +453,7 @@ def test_a_points_error_is_its_distance_to_the_nearest_surface(kind, size, p, er
 # --- errors -------------------------------------------------------------------------------------
 
 
-def test_a_body_without_a_pose_is_told(recorded, peg_task):
+def test_a_body_without_a_pose_is_reported(recorded, peg_task):
     with pytest.raises(UnknownName, match="unknown body 'table'"):
         surface_errors(recorded, peg_task.scene, {"block": np.eye(4)})
 

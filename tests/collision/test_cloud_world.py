@@ -95,7 +95,7 @@ def test_what_was_lifted_reaches_down_to_where_it_stood(toolbox):
 
 
 def test_where_the_true_bodies_are_makes_no_difference(peg):
-    """Nothing of the simulated scene but what was seen is looked at."""
+    """Nothing of the simulated scene but what was seen is used."""
     far = {k: T @ pose([0, 0, -5]) for k, T in peg.demonstration.body_Ts_world.items()}
     blind = dataclasses.replace(peg.demonstration, body_Ts_world=far)
     elsewhere = CloudWorld(blind, peg.robot, peg.task.scene)

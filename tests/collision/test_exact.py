@@ -40,8 +40,8 @@ def test_all_bodies_are_where_they_were_seen(picked, when, first_grasp):
 def test_what_is_grasped_moves_with_the_tool_and_is_no_obstacle(picked, rng, first_grasp):
     t = first_grasp + 10
     placed, steps = picked.placed(t), picked.demonstration.steps
-    carried = [part for part in placed.parts if part.body == "toolbox"]
-    assert {part.joint for part in carried} == {6}
+    grasped_parts = [part for part in placed.parts if part.body == "toolbox"]
+    assert {part.joint for part in grasped_parts} == {6}
     assert "toolbox" not in {placed.names(k)[1] for k in range(len(placed.pairs))}
     assert ("toolbox", "table") in {placed.names(k) for k in range(len(placed.pairs))}
     T_tool_box = inverse(steps.measured_Ts_world_tool[t])
@@ -103,8 +103,8 @@ def test_what_is_carried_may_move_in_the_grasp_by_its_play(picked, toolbox, firs
     )
     for scene, play in ((picked, 0.005), (tight, 0.0)):
         placed = scene.placed(t)
-        carried = np.array([placed.names(k)[0] == "toolbox" for k in range(len(placed.pairs))])
-        np.testing.assert_array_equal(placed.slip, play * carried)
+        of_grasped = np.array([placed.names(k)[0] == "toolbox" for k in range(len(placed.pairs))])
+        np.testing.assert_array_equal(placed.slip, play * of_grasped)
         assert not scene.placed(3).slip.any()
 
 

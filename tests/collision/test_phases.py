@@ -27,7 +27,7 @@ def test_phases_tell_approach_grasp_and_lift_apart(picked, first_grasp):
 
 
 def test_what_stands_on_something_else_is_no_contact_of_the_robots(picked, first_grasp):
-    # The toolbox stands on the table; only once it is carried is that a contact.
+    # The toolbox stands on the table; only once it is lifted is that a contact.
     grasped = first_grasp
     assert ("table", "toolbox") in picked.demonstration.touching[grasped - 5]
     assert picked.phases[grasped - 5].contacts == frozenset()

@@ -225,7 +225,7 @@ def test_a_directory_or_file_of_someone_else_is_left_alone(carry_out, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_manifest_that_can_not_be_read_is_told_and_may_be_overwritten(carry_out, tmp_path):
+def test_a_manifest_that_can_not_be_read_is_reported_and_may_be_overwritten(carry_out, tmp_path):
     (tmp_path / "manifest.jsonl").write_text('{"schema_version": 1}\n')
     with pytest.raises(BrokenFile, match="schema_version is 1"):
         carry_out(tmp_path)
@@ -262,7 +262,7 @@ def test_what_writes_episodes_goes_to_other_processes(source_of, episode_of, tmp
         assert len(writer.finish({})) == 1
 
 
-def test_a_full_disk_is_told_and_resumed_from(carry_out, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_resumed_from(carry_out, tmp_path, monkeypatch):
     whole = carry_out(tmp_path / "whole")
     save, left = writer_module.save_episode, [5]
 

@@ -180,7 +180,7 @@ def test_placements_follow_from_the_evaluation_seed_and_the_episode_alone(peg_ta
     assert drawn != [episode_placement(peg_task, 8, i) for i in range(50)]
 
 
-def test_objects_are_turned_and_looks_vary_where_asked_for(evaluate, short_task):
+def test_objects_are_turned_and_the_appearance_varies_where_asked_for(evaluate, short_task):
     class Watching(Player):
         def reset(self):
             super().reset()
@@ -190,7 +190,7 @@ def test_objects_are_turned_and_looks_vary_where_asked_for(evaluate, short_task)
     for name, options in (
         ("plain", {}),
         ("turned", {"yaw_deg": 15.0}),
-        ("looks", {"vary_looks": True}),
+        ("appearance", {"vary_appearance": True}),
     ):
         player = Watching()
         player.rollouts = []
@@ -198,10 +198,10 @@ def test_objects_are_turned_and_looks_vary_where_asked_for(evaluate, short_task)
         placements[name] = [row["placement"]["block"] for row in rows]
         # The table's colour in the corner of each rollout's first image.
         tables[name] = {tuple(seen[0][0][-1, 0]) for seen in player.rollouts}
-    assert placements["plain"] == placements["looks"]
+    assert placements["plain"] == placements["appearance"]
     assert {p["yaw_deg"] for p in placements["plain"]} == {0.0}
     assert len({p["yaw_deg"] for p in placements["turned"]}) == 3
-    assert len(tables["plain"]) == 1 and len(tables["looks"]) == 3
+    assert len(tables["plain"]) == 1 and len(tables["appearance"]) == 3
 
 
 def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
@@ -221,7 +221,7 @@ def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
     assert result["ci95"] == result["ci95_any"] == list(wilson_interval(0, 3))
     assert result["seeds"] == {"eval_seed": 11, "episodes": [[11, 0], [11, 1], [11, 2]]}
     assert result["seconds"] > 0 and result["videos"] == [] and "python" in result["versions"]
-    asked = {"episodes": 3, "eval_seed": 11, "videos": 0, "yaw_deg": 0.0, "vary_looks": False}
+    asked = {"episodes": 3, "eval_seed": 11, "videos": 0, "yaw_deg": 0.0, "vary_appearance": False}
     assert result["config"] == asked
     for i, row in enumerate(result["episodes"]):
         assert row["episode"] == i and row["seed"] == [11, i] and row["steps"] == 6

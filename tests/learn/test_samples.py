@@ -237,7 +237,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_read(dataset, tmp_pat
     assert not read
 
 
-def test_a_disk_that_fills_up_is_told_and_leaves_nothing(dataset, tmp_path):
+def test_a_disk_that_fills_up_is_reported_and_leaves_nothing(dataset, tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
     try:

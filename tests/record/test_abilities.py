@@ -128,7 +128,7 @@ def test_what_needs_an_ability_names_it_and_says_what_for(
 def test_what_a_robot_was_really_sent_is_what_is_recorded(
     peg_backend, peg_task, peg_model, limited, monkeypatch
 ):
-    """And the next command goes on from there."""
+    """And the next command continues from there."""
     arm, sent = limited(peg_backend, Resets, KnowsBodies), []
 
     def half_as_far(q, gripper):

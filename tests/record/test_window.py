@@ -91,7 +91,7 @@ def test_events_are_told_by_the_names_of_keys(pygame, screen):
     assert list(screen.events()) == [Key("right", True), Key("w", False), FocusLost(), Closed()]
 
 
-def test_every_phase_looks_different_and_shows_the_scene(pygame, window):
+def test_every_state_looks_different_and_shows_the_scene(pygame, window):
     images = {}
 
     def look():
@@ -182,7 +182,7 @@ def test_words_too_long_for_their_box_end_in_an_ellipsis(pygame, screen, monkeyp
 
 
 @pytest.mark.parametrize("display", [None, ":987"])
-def test_without_a_display_the_remedy_is_told(monkeypatch, display):
+def test_without_a_display_the_remedy_is_reported(monkeypatch, display):
     pytest.importorskip("pygame")
     for name in ("SDL_VIDEODRIVER", "WAYLAND_DISPLAY", "DISPLAY"):
         monkeypatch.delenv(name, raising=False)

@@ -122,8 +122,8 @@ def test_what_is_carried_moves_with_the_tool_in_a_segment(tmp_path, drawn_states
     operator = ScriptedOperator(plan, np.random.default_rng(0))
     demo = record_demonstration(backend, task, model, operator)
     scene = ExactWorld(demo, robot, task.scene)
-    carried = [t for t, phase in enumerate(scene.phases) if phase.grasped]
-    spheres = suggest_annotation(demo, scene, [carried[len(carried) // 2]])
+    grasped = [t for t, phase in enumerate(scene.phases) if phase.grasped]
+    spheres = suggest_annotation(demo, scene, [grasped[len(grasped) // 2]])
     made = augment_demonstration(demo, spheres, make, tmp_path / "d", AugmentConfig(n=2))
     playback = Playback("episode.h5", demo, made.episode(0))
     SceneView(playback, backend, "overview").image(0, 32)

@@ -191,7 +191,7 @@ def test_inset_shows_the_wrist_in_its_corner_and_leaves_the_rest() -> None:
 
 
 @pytest.mark.parametrize("corner", ["top left", "top right", "bottom left", "bottom right"])
-def test_inset_goes_where_it_is_told(corner: Any) -> None:
+def test_inset_goes_where_it_is_reported(corner: Any) -> None:
     frame = grey(240, 320)
     changed = (inset(frame, grey(64, 96, 20), corner=corner) != frame).any(axis=2)
     y, x = np.argwhere(changed).mean(axis=0)

@@ -178,7 +178,7 @@ def test_a_resource_of_a_missing_package_says_how_to_install_it(package):
         resource_path(f"{package}:robot.urdf")
 
 
-def test_a_missing_resource_is_told(tmp_path):
+def test_a_missing_resource_is_reported(tmp_path):
     with pytest.raises(MissingFile, match=r"airo_models:x.urdf: no such file \(x.urdf\)"):
         resource_path("airo_models:x.urdf")
     with pytest.raises(MissingFile, match="no such file"):

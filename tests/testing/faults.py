@@ -443,7 +443,7 @@ class _OnlyDrawsIn(Joint):
 
 
 class DetentsOnlyDrawIn(_OtherJoints):
-    """A catch pulls from as far as it is felt."""
+    """A catch pulls from its full width."""
 
     def spoilt(self, joint: Joint) -> Joint:
         return _OnlyDrawsIn(**{f.name: getattr(joint, f.name) for f in dataclasses.fields(joint)})
@@ -466,7 +466,7 @@ class BodiesFallInHoney(PyBulletBackend):
 
 
 class ResetKeepsSpeed(PyBulletBackend):
-    """Free bodies go on as fast as they were."""
+    """Free bodies keep moving as fast as they were."""
 
     _stepped = False
 
@@ -524,7 +524,7 @@ class RestoreForgetsSpeeds(PyBulletBackend):
 
 
 class RestoreForgetsTime(PyBulletBackend):
-    """Time goes on."""
+    """Time passes."""
 
     def restore(self, state: bytes) -> None:
         time = self._time

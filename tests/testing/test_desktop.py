@@ -35,7 +35,7 @@ def without_program(monkeypatch, name):
 
 
 @pytest.mark.parametrize("name", ["Xvfb", "xdotool"])
-def test_without_its_programs_the_remedy_is_told(monkeypatch, name):
+def test_without_its_programs_the_remedy_is_reported(monkeypatch, name):
     without_program(monkeypatch, name)
     with pytest.raises(MissingExtra, match=f"{name} not found; type: bash tools/setup_debian.sh"):
         check_desktop()

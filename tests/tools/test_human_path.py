@@ -23,10 +23,10 @@ def test_a_demonstration_is_recorded_by_keys_alone_in_the_real_window(tmp_path, 
     assert "record " in capsys.readouterr().out
     demo = load_demonstration(tmp_path / "demo.h5")
     assert demo.success[-10:].all() and demo.device == "keyboard"
-    assert demo.operator == "machine hands"
+    assert demo.operator == "scripted input"
     assert demo.seconds >= demo.timestamps[-1] * 0.9
-    for phase in ("ready", "recording", "ended", "saved"):
-        with Image.open(tmp_path / "images" / f"record_{phase}.png") as image:
+    for state in ("ready", "recording", "ended", "saved"):
+        with Image.open(tmp_path / "images" / f"record_{state}.png") as image:
             assert image.size == (1280, 800)
     rows = [json.loads(line) for line in (tmp_path / "status.jsonl").read_text().splitlines()]
     assert [rows[0]["state"], rows[-1]["state"]] == ["ready", "saved"]

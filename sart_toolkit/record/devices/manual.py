@@ -142,7 +142,7 @@ class ManualDevice(Device):
         return
 
     def rest(self) -> None:
-        """The hand at rest and the gripper as at the start, for another try."""
+        """The hand at rest and the gripper as at the start, for another attempt."""
         self.gripper = self._start_gripper
         self.halt()
         self.let_go()
@@ -152,7 +152,7 @@ class ManualDevice(Device):
         self._velocity = np.zeros(6)
 
     def let_go(self) -> None:
-        """Forget what is pressed: the window no longer hears when keys are released."""
+        """Forget what is pressed: the window is no longer notified when keys are released."""
         return
 
     def key(self, name: str, down: bool) -> bool:
@@ -180,7 +180,7 @@ class ManualDevice(Device):
         self.frame = "tool" if self.frame == "world" else "world"
 
     def switch_gripper(self) -> None:
-        """Open the gripper if it is told to hold, close it if it is told to open."""
+        """Open the gripper if it is commanded to hold, close it if it is commanded to open."""
         self.gripper = 0.0 if self.gripper > 0.5 else 1.0
 
     def change_speed(self, by: int) -> None:
