@@ -39,7 +39,7 @@ class Finding:
         ok: whether it works.
         detail: what was found, or what went wrong.
         remedy: what to do about it; empty where `ok`.
-        required: whether the toolkit is of no use without it.
+        required: whether the toolkit is useless without it.
         tested: whether it was tested, and not only found to be installed.
     """
 
@@ -60,7 +60,7 @@ class Probe:
         target: `module:function`; the function returns what it found, or raises.
         extra: the extra of sart_toolkit that it belongs to; empty for the core.
         remedy: what to do where the function fails, other than for a missing package or library.
-        required: whether the toolkit is of no use without it.
+        required: whether the toolkit is useless without it.
         timeout_s: how long it may take [s].
         packages: for an answer without trying: the installed packages that it needs.
     """
@@ -138,7 +138,7 @@ _CHILD = "import sys; from sart_toolkit.doctor import answer; answer(sys.argv[1]
 
 
 def answer(target: str, answer_file: str) -> None:
-    """Runs in the probe's process: calls `module:function` and writes what came of it as JSON."""
+    """Runs in the probe's process: calls `module:function` and writes the result as JSON."""
     module, _, function = target.partition(":")
     try:
         detail = getattr(importlib.import_module(module), function)()

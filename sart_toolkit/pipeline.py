@@ -1,4 +1,4 @@
-"""The stages from a demonstration to a report, and all of them in a row: what `sart` calls.
+"""The stages from a demonstration to a report, and all of them in sequence: what `sart` calls.
 
 Robots, tasks, backends, strategies and policies are given as names, references (see `registry`) or
 objects. Later stages find those of a recording by the references that it holds, unless others are
@@ -229,7 +229,7 @@ def record(
         robot: the task's own if left out.
         backend: where it is shown.
         device: what steers.
-        steer: follows a device that a person holds, and saves what came of it.
+        steer: follows a device that a person holds, and saves the recording.
         by_hand: flags that mean nothing to any other device, which are refused with one.
         frame: what a person's directions are fixed to at first.
         operator: who steers, where it is a person.
@@ -503,7 +503,7 @@ def evaluate(
     progress: Progress = _silent,
     **options: Any,
 ) -> dict[str, Any]:
-    """How a skill's directory fares on random placements, saved in the file `out`.
+    """How well a skill's directory performs on random placements, saved in the file `out`.
 
     Args:
         skill: the skill.

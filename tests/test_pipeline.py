@@ -177,7 +177,7 @@ def test_a_whole_run_takes_objects_and_resumes(there, tmp_path, caplog):
     assert {kind: config[kind] for kind in NOTED} == NOTED
     (tmp_path / "run" / "evaluation.json").unlink()
     caplog.clear()
-    # The same, told by reference.
+    # The same, given by reference.
     given |= {"robot": "my_things.py:ROBOT", "backend": "my_things.py:Simulator"}
     sart.run("my_things.py:Drawer", tmp_path / "run", **given)
     assert [record.message.split()[0] for record in caplog.records] == [

@@ -2,10 +2,10 @@
 
 A demonstration is recorded with the keyboard and annotated, then augmented and trained on, and the
 skill is evaluated. A virtual screen shows the windows, keys are pressed on it as fingers
-would, and images are taken. The hands know no more than eyes would tell them: where the tool is
+would, and images are taken. The hands know no more than eyes would show them: where the tool is
 and what the windows say, read from `--status` and from the annotator's journal; and where the
 object stands. Each stage is a function and a line in `STAGES`; they leave what a person's work
-would leave in DIR, and `human_path.json` tells what came of each.
+would leave in DIR, and `human_path.json` holds the result of each.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def record(options: argparse.Namespace, images: Path) -> dict[str, Any]:
-    """What came of recording `demo.h5` with the keyboard; images of each state are taken."""
+    """The result of recording `demo.h5` with the keyboard; images of each state are taken."""
     name, directory = options.task, options.directory
     task = get_task(name)
     model = RobotModel(get_robot(task.robot), task.scene.held)
@@ -211,19 +211,19 @@ class _Hands:
 
 
 def annotate(options: argparse.Namespace, images: Path) -> dict[str, Any]:
-    """What came of annotating by hand: `annotation.json`."""
+    """The result of annotating by hand: `annotation.json`."""
     return _annotated(options, "annotation", BY_HAND, images)
 
 
 def suggest(options: argparse.Namespace, images: Path) -> dict[str, Any]:
-    """What came of taking all suggestions instead: `suggested.json`."""
+    """The result of taking all suggestions instead: `suggested.json`."""
     return _annotated(options, "suggested", SUGGESTED, images)
 
 
 def _annotated(
     options: argparse.Namespace, name: str, keys: Sequence[str], images: Path
 ) -> dict[str, Any]:
-    """What came of pressing keys in the annotator's window, the last of which save and leave.
+    """The result of pressing keys in the annotator's window, the last of which save and leave.
 
     The next key is pressed once the one before has been done, which the journal tells; `seconds`
     are those from the first key to the window's end, without those for an image of it.
@@ -271,7 +271,7 @@ def _annotated(
 
 
 def augment(options: argparse.Namespace, images: Path) -> dict[str, Any]:
-    """What came of augmenting with the annotation by hand: `dataset/`."""
+    """The result of augmenting with the annotation by hand: `dataset/`."""
     folder = options.directory
     made = _sart("augment", folder / "demo.h5", folder / "annotation.json",
                  "--out", folder / "dataset", "--workers", 2, "--overwrite")  # fmt: skip
@@ -279,14 +279,14 @@ def augment(options: argparse.Namespace, images: Path) -> dict[str, Any]:
 
 
 def train(options: argparse.Namespace, images: Path) -> dict[str, Any]:
-    """What came of training on the dataset: `skill/`."""
+    """The result of training on the dataset: `skill/`."""
     folder = options.directory
     made = _sart("train", folder / "dataset", "--out", folder / "skill", "--overwrite")
     return {"policy": made["policy"], "seconds": made["seconds"]}
 
 
 def evaluate(options: argparse.Namespace, images: Path) -> dict[str, Any]:
-    """What came of trying the skill: `evaluation.json`."""
+    """The result of trying the skill: `evaluation.json`."""
     folder = options.directory
     made = _sart("evaluate", folder / "skill", "--out", folder / "evaluation.json",
                  "--episodes", options.episodes, "--workers", 2, "--overwrite")  # fmt: skip

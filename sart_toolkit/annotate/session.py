@@ -308,7 +308,7 @@ class AnnotationSession:
         return name is not None
 
     def perform(self, name: str, value: float | None = None) -> None:
-        """Do one action; `message` tells what came of it.
+        """Do one action; `message` says what it did.
 
         Args:
             name: the action's, as in `ACTIONS`.
@@ -584,7 +584,7 @@ class AnnotationSession:
         self._undo, self._redo = [], []
 
     def _replay(self, row: dict[str, Any]) -> None:
-        """Do again what one row of a journal tells."""
+        """Do again what one row of a journal records."""
         if "base" in row:
             self._rebase(row["base"])
         if row["action"] == "undo" and self._undo:

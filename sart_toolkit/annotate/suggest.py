@@ -1,4 +1,4 @@
-"""Radii from the scene's geometry instead of from a person's eye."""
+"""Radii from the scene's geometry instead of a person's judgement."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class _Worker:
         self._executor = get_executor(config.executor)(self._backend, pairs, config)
 
     def results(self, keys: Iterable[AttemptKey]) -> Iterator[_Result]:
-        """What comes of attempts, one after the other, in the executor's order."""
+        """The results of attempts, one after the other, in the executor's order."""
         for attempt in self._executor.attempts(keys):
             episode = attempt.episode
             entry = None if episode is None else self._files.write(episode)

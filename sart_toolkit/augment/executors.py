@@ -40,7 +40,7 @@ _FROM_STATES = "segments start from the demonstration's saved states"
 class Attempt:
     """The outcome of an attempt: the episode, or the reason why it was rejected.
 
-    `outcome` is the same for all attempts that fail alike; `detail` tells this one's figures.
+    `outcome` is the same for all attempts that fail alike; `detail` gives this one's figures.
     """
 
     key: AttemptKey

@@ -213,7 +213,7 @@ class SensesForce(abc.ABC):
 
 
 class SensesContacts(SensesForce):
-    """Can tell which bodies touch, and so how hard."""
+    """Knows which bodies touch, and so how hard."""
 
     @abc.abstractmethod
     def contacts(self) -> list[Contact]:
@@ -229,7 +229,7 @@ class SensesContacts(SensesForce):
 
 
 class KnowsBodies(abc.ABC):
-    """Can tell where the bodies are: those of the scene and those that the robot holds."""
+    """Knows where the bodies are: those of the scene and those that the robot holds."""
 
     @abc.abstractmethod
     def body_poses(self) -> dict[str, Array]:

@@ -108,7 +108,7 @@ class SphereTrial:
         """What became of a sphere's draws, as JSON values; distances in millimetres.
 
         `collisions` counts poses at which one of the two models of the whole robot overlaps, with
-        what is grasped where it was in the grasp. `within_margin` tells whether a directed draw
+        what is grasped where it was in the grasp. `within_margin` says whether a directed draw
         came nearer than the margin, and the slip tolerance, that a suggested radius leaves.
         """
         t = sphere.waypoint

@@ -24,7 +24,7 @@ def benchmark_replay(
     """What a demonstration's commands do on every other backend, object placed the same.
 
     For each task a demonstration is recorded on each of its backends and replayed on the others.
-    Rows tell the greatest difference of the measured tool poses over all recorded steps at which
+    Rows give the greatest difference of the measured tool poses over all recorded steps at which
     neither run's robot, or what it grasps, touched anything else.
 
     Args:

@@ -55,7 +55,7 @@ class SegmentsConfig:
 
 @dataclass(frozen=True)
 class LimitCheck:
-    """How a motion fares against the robot's limits, and what is commanded against its path.
+    """How a motion compares with the robot's limits, and what is commanded against its path.
 
     `ratios`: the greatest joint velocity, acceleration and jerk over their limits, at any physics
     step; `violations`: how many of these samples, joints counted singly, exceed theirs. `off` [m]:
@@ -189,7 +189,7 @@ def benchmark_segments(
     progress: Callable[[int, int, int], None] | None = None,
     about: Mapping[str, Any] = _NOTHING,
 ) -> dict[str, Any]:
-    """How augmentation's segments fare in simulation, and whether they keep what they promise.
+    """How augmentation's segments perform in simulation, and whether they keep what they promise.
 
     For each cell a demonstration of the scripted operator is recorded and spheres are suggested;
     the attempts are shared evenly among the cells, and go round-robin over a cell's spheres. No

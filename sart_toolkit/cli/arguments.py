@@ -439,7 +439,7 @@ class BenchmarkOperator:
 
 @dataclass(frozen=True)
 class BenchmarkReplay:
-    """How a demonstration recorded on one backend fares when its commands are given on another.
+    """How well a demonstration recorded on one backend replays on another.
 
     Example: sart benchmark replay --tasks all --backends pybullet,sapien --out replay.json
     """
@@ -454,7 +454,7 @@ class BenchmarkReplay:
 
 @dataclass(frozen=True)
 class BenchmarkSegments:
-    """How augmentation's segments fare: kept, touched, off their path, beyond the joints' limits.
+    """How augmentation's segments perform: kept, touched, off their path, beyond joint limits.
 
     On each task and backend a demonstration is recorded, spheres are suggested, and segments are
     attempted from them in turn, without images. With --source cloud spheres and segments are

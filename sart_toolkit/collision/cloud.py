@@ -89,7 +89,7 @@ class SceneCloud:
     """Points of a scene `(n, 3)` [m] in the world, their `colours (n, 3)` uint8.
 
     `behind (n,)`: the point was not seen but filled in by the rule for unknown space; of such
-    points only the outer layer is kept. `config` tells how the cloud was made.
+    points only the outer layer is kept. `config` says how the cloud was made.
     """
 
     points: Array
@@ -268,7 +268,7 @@ class _View:
     def misfit(self, p_world: Array, voxel: float) -> Array:
         """How far `(n,)` [m] points are from what the image shows at their pixels.
 
-        It is the tolerance at most, and NaN where the image tells nothing: outside of it, where
+        It is the tolerance at most, and NaN where the image shows nothing: outside of it, where
         it has no depth, and behind something nearer.
         """
         rows, pixels, z = self.project(p_world)
@@ -511,7 +511,7 @@ def _cell_centres(numbers: NDArray[np.int64], voxel: float) -> Array:
 
 
 class _MeanMisfit:
-    """The mean of points' misfits over the images that tell of them."""
+    """The mean of points' misfits over the images that show them."""
 
     def __init__(self, n: int) -> None:
         self._sum, self._count = np.zeros(n), np.zeros(n)
@@ -522,7 +522,7 @@ class _MeanMisfit:
         self._count[measured] += 1
 
     def mean(self) -> Array:
-        """The means `(n,)` [m], infinite where no image tells."""
+        """The means `(n,)` [m], infinite where no image shows them."""
         return np.where(self._count > 0, self._sum / np.maximum(self._count, 1), np.inf)
 
 

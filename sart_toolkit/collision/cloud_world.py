@@ -57,7 +57,7 @@ class CloudWorld(CollisionWorld):
         Args:
             demonstration: what was shown and seen.
             robot: the robot that was steered.
-            scene: tells what is fixed to the robot and which bodies can be lifted; where its bodies
+            scene: says what is fixed to the robot and which bodies can be lifted; where its bodies
                 are and what shape they have is not used.
             slip_tolerance: how far [m] what is grasped may move in the grasp.
             config: how images become a cloud.
@@ -96,7 +96,7 @@ class CloudWorld(CollisionWorld):
         return self._placed[t]
 
     def moving(self, t: int) -> str | None:
-        """Always `None`: images of one moment don't tell what moves."""
+        """Always `None`: images of one moment don't show what moves."""
         return None
 
     def unknown(self, t: int) -> str | None:

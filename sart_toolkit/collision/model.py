@@ -401,7 +401,7 @@ class PlacedModel:
     def near_pairs(self, q: Array, within: float) -> list[int]:
         """All pairs, by index, that are nearer than `within` [m] at `q (n,)`, and perhaps others.
 
-        Those that rough bounds tell to be farther away are left out.
+        Those that rough bounds show to be farther away are left out.
         """
         placed = self.bounds.placed(self.joint_poses(q)[None])
         every = np.arange(len(self.pairs))

@@ -38,7 +38,7 @@ class CollisionWorld(ABC):
         scene: SceneSpec,
         slip_tolerance: float,
     ) -> None:
-        """Tell the demonstration's phases apart.
+        """Find the demonstration's phases.
 
         Raises:
             Mismatch: the demonstration is of another robot.

@@ -372,7 +372,7 @@ class PrecisionSphere:
     """How far the tool may stray around one key waypoint: radius [m] about `T_world_key (4,4)`.
 
     `waypoint` is the index of the key waypoint in the demonstration. `clearance` [m] and
-    `limited_by` tell what backed a suggested radius: the distance of the pair of bodies that
+    `limited_by` say what backed a suggested radius: the distance of the pair of bodies that
     bounds it.
     """
 

@@ -183,7 +183,7 @@ class Journal:
         except OSError as error:
             self._file.close()
             raise CannotWrite(
-                f"{self.path}: another process is at work on it; end that one first, or choose "
+                f"{self.path}: another process is using it; end that one first, or choose "
                 "another --out"
             ) from error
         self._file.seek(0)

@@ -1,4 +1,4 @@
-"""Seeded rollouts of a skill, what came of each, and the first of either outcome for a film."""
+"""Seeded rollouts of a skill, the outcome of each, and the first of either outcome for a video."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from sart_toolkit.record.session import End, SessionState, TeleopSession
 
 # More than this [N] is a hard press, which a person should be warned of before all else.
 FIRM = 50.0
-# So much [s] may be thrown away without being asked again.
+# So much [s] may be discarded without confirmation.
 _SOON_DONE_AGAIN = 3.0
 
 Tone = Literal["plain", "good", "warning", "bad"]
@@ -31,7 +31,7 @@ class RecordingDesk:
     """Where a person's session, device and controls meet.
 
     Whoever shows it calls `tick` for each control period, `press` for each control, and reads
-    `notice`. Nothing is thrown away or saved short of the goal without being asked a second time.
+    `notice`. Discarding a recording, or saving one that missed the goal, has to be confirmed.
 
     Attributes:
         session: the recording.
@@ -166,7 +166,7 @@ class RecordingDesk:
 
     def _go_on(self) -> None:
         try:
-            # Reading tells whether it answers; what it asks for is not carried out.
+            # Reading shows whether it answers; what it asks for is not carried out.
             self.device.read(self.session.observation)
         except DeviceLost:
             try:

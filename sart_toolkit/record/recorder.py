@@ -26,7 +26,7 @@ class StepRecorder:
 
         Args:
             backend: the robot.
-            model: its kinematics, which tell what each camera is mounted on.
+            model: its kinematics, which say what each camera is mounted on.
             cameras: names of cameras that move with the tool or stand still.
 
         Raises:

@@ -122,7 +122,7 @@ class SessionConfig:
 
 
 class SessionState(enum.Enum):
-    """What a session is at; the value is the word that a person reads."""
+    """The state of a session; the value is the word that a person reads."""
 
     READY = "ready"
     RECORDING = "recording"
@@ -145,13 +145,13 @@ class TeleopSession:
     It draws nothing, and only the backend makes it wait: each `advance` is one control period.
     While it isn't recording a simulation stands still.
 
-    A backend that can't be reset is recorded from wherever the robot is, and its placement is what
-    it is told. One that lacks what the task's success is judged by records no success; a person may
+    A backend that can't be reset is recorded from wherever the robot is, and its placement is the
+    one given. One that lacks what the task's success is judged by records no success; a person may
     say that the goal was reached, see `say_reached`.
 
     Attributes:
         state: what it is at.
-        judged_by: who tells whether the goal is reached: the task, a person, or nobody yet.
+        judged_by: who decides whether the goal is reached: the task, a person, or nobody yet.
         end: why it ended, once it has.
         gripper: the gripper command in force, in [0, 1].
         trouble: why the last command was not carried out; empty where it was.
@@ -176,7 +176,7 @@ class TeleopSession:
             model: the robot's kinematics.
             placement: where the object stands; in the middle of its range if left out.
             config: cameras and limits.
-            clock: tells the wall-clock time [s].
+            clock: returns the wall-clock time [s].
 
         Raises:
             UnknownName: there is no such camera.
@@ -274,7 +274,7 @@ class TeleopSession:
         if self._judges:
             return self.task.failure_reason(self._now)
         lacking = ", ".join(missing_abilities(self.backend, self.task.observes))
-        return f"backend {self.backend.name!r} can't tell, for want of {lacking}"
+        return f"backend {self.backend.name!r} can't tell, since it lacks {lacking}"
 
     @property
     def _record_hz(self) -> int:
@@ -340,7 +340,7 @@ class TeleopSession:
         self._expect("say_reached", SessionState.ENDED)
         if self._judges:
             raise InvalidInput(
-                "say_reached: this backend tells by itself whether the goal is reached"
+                "say_reached: this backend itself decides whether the goal is reached"
             )
         held = min(len(self._success), max(1, round(self.task.hold * self._record_hz)))
         self._success[-held:] = [True] * held

@@ -52,10 +52,10 @@ _SAVED_SHOWN = 2.0
 
 
 class Pace:
-    """Tells when control periods are due, so that simulated and real time go by alike.
+    """Says when control periods are due, so that simulated and real time go by alike.
 
     A machine that falls behind catches up; what it can't make good within a quarter of a second it
-    lets go, and `share` tells. No period is ever left out.
+    lets go, and `share` says by how much. No period is ever left out.
 
     Attributes:
         share: simulated over real time, over the last second.

@@ -218,7 +218,7 @@ class PlayWindow:
             scene: draws it from outside; without it the wrist view is shown large.
             screen: where it is drawn.
             speed: times real time.
-            clock: tells the time [s].
+            clock: returns the time [s].
 
         Raises:
             InvalidInput: the speed is not positive.

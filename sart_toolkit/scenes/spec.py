@@ -117,7 +117,7 @@ class Body:
     """A rigid body standing in the world; its pose is part of the `SceneState`.
 
     `mass` [kg], or `None` for one that never moves; `friction` is the Coulomb coefficient. A body
-    with a `joint` moves on another one only; `T_world_body` is then of no account.
+    with a `joint` moves on another one only; `T_world_body` is then ignored.
     """
 
     name: str

@@ -151,7 +151,7 @@ class Bench:
         return require(self.backend, SensesContacts, _TESTED).contacts()
 
     def relies_on(self, holds: object, test: str) -> None:
-        """Skip the test where it can't tell anything before another one passes."""
+        """Skip the test where it means nothing before another one passes."""
         if not holds:
             pytest.skip(f"not judged before {test} passes")
 

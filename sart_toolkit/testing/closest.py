@@ -254,7 +254,7 @@ class ClosestPoints:
         """Put the bodies and the gripper where they are in what is asked next.
 
         Args:
-            Ts_world_body: poses `(4, 4)` of all bodies; of grasped ones they are of no account.
+            Ts_world_body: poses `(4, 4)` of all bodies; those of grasped ones are ignored.
             gripper: where the gripper is, 0 open to 1 closed.
             T_tool_grasped: poses `(4, 4)` in the tool frame of the bodies that move with it.
             allowed: pairs of names that may touch; they are not considered.

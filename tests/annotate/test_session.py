@@ -574,9 +574,9 @@ def test_a_kill_at_any_moment_loses_the_last_key_press_at_most(open_session, tmp
                 break
         process.send_signal(signal.SIGKILL)
         lines += process.communicate()[0].splitlines(keepends=True)
-        told = [x.strip().split(";") for x in lines if x.endswith("\n") and ";" in x]
+        printed = [x.strip().split(";") for x in lines if x.endswith("\n") and ";" in x]
         session = open_session()
-        presses, selected, state = told[-1]
+        presses, selected, state = printed[-1]
         assert session.presses in (int(presses), int(presses) + 1)
         if session.presses == int(presses):
             assert session.selected == int(selected)

@@ -93,9 +93,9 @@ def test_every_sphere_rejoins_before_the_gripper_or_a_contact_changes(
 
 
 def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, grasped_at):
-    carrying = [bool(grasped_at[sphere.waypoint]) for sphere in annotation.spheres]
-    assert not carrying[0] and carrying[-1]
-    assert carrying == sorted(carrying)
+    grasping = [bool(grasped_at[sphere.waypoint]) for sphere in annotation.spheres]
+    assert not grasping[0] and grasping[-1]
+    assert grasping == sorted(grasping)
     reasons = [sphere.limited_by for sphere in annotation.spheres]
     assert any("gripper command at waypoint" in reason for reason in reasons)
     assert any(reason == "toolbox / table" for reason in reasons)

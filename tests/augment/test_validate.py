@@ -1,4 +1,4 @@
-"""A dataset that was tampered with is told, whatever was changed in it."""
+"""A dataset that was tampered with is reported, whatever was changed in it."""
 
 import dataclasses
 import json
@@ -68,7 +68,7 @@ def test_what_was_generated_holds(made, validate):
     assert found.largest_deviation == pytest.approx(max(p["deviation"] for p in proofs), abs=2e-6)
 
 
-def test_a_truncated_episode_and_a_missing_one_are_told_and_the_others_still_checked(
+def test_a_truncated_episode_and_a_missing_one_are_reported_and_the_others_still_checked(
     copy, validate
 ):
     torn, missing, _ = (entry.name for entry in load_dataset(copy).index)

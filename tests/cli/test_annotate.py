@@ -113,7 +113,7 @@ def test_from_a_pipe_the_first_word_that_cannot_be_done_is_an_error(refused, dem
         assert message in refused(demo, "--text", words=words)
 
 
-def test_at_a_terminal_mistakes_are_told_and_ctrl_c_keeps_the_work(demo, wait_until):
+def test_at_a_terminal_mistakes_are_reported_and_ctrl_c_keeps_the_work(demo, wait_until):
     here, there = pty.openpty()
     process = subprocess.Popen(
         [*SART, str(demo), "--text"], stdin=there, stdout=there, stderr=there, close_fds=True
@@ -147,7 +147,7 @@ def test_at_a_terminal_mistakes_are_told_and_ctrl_c_keeps_the_work(demo, wait_un
     assert demo.with_name("demo.annotation.json.journal").exists()
 
 
-def test_headless_nothing_is_replaced_unless_told(annotate, refused, demo):
+def test_headless_nothing_is_replaced_unless_asked_for(annotate, refused, demo):
     headless = (demo, "--suggest-all", "--no-window")
     annotate(*headless)
     assert "already exists; add --overwrite" in refused(*headless)

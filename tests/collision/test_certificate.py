@@ -424,8 +424,8 @@ def test_where_there_is_nothing_to_hit_all_is_free(rods):
     certificate.check_free()
 
 
-@pytest.mark.parametrize("play", [0.0, 0.003])
-def test_what_is_grasped_is_proved_clear_by_its_play_and_the_margin(play):
+@pytest.mark.parametrize("slip", [0.0, 0.003])
+def test_what_is_grasped_is_proved_clear_by_its_slip_and_the_margin(slip):
     box, table = Shape("box", (0.1, 0.1, 0.1)), Shape("box", (4, 4, 0.1))
     bodies = (Body("box", (box,), mass=0.1), Body("table", (table,)))
     collision = CollisionModel(get_robot("ur5e_2f85"), SceneSpec(bodies))
@@ -436,11 +436,11 @@ def test_what_is_grasped_is_proved_clear_by_its_play_and_the_margin(play):
     T_world_table = pose([0, 0, lowest - 0.05 - 0.004])
     placed = collision.placed(
         {"table": T_world_table}, 0.0, {"box": T_tool_box},
-        [("base_link_inertia", "table"), *((part, "table") for part in ARM)], play,
+        [("base_link_inertia", "table"), *((part, "table") for part in ARM)], slip,
     )  # fmt: skip
     path = PolylinePath([q, q + [0, 0, 0, 0, 0, 1.0]])
-    assert certify(placed, path, 0.004 - play - 2e-4).verdict == "free"
-    assert certify(placed, path, 0.004 - play + 2e-4).verdict == "collision"
+    assert certify(placed, path, 0.004 - slip - 2e-4).verdict == "free"
+    assert certify(placed, path, 0.004 - slip + 2e-4).verdict == "collision"
 
 
 # --- margin and effort --------------------------------------------------------------------------

@@ -291,7 +291,7 @@ T_TOOL_BOX = pose([0.01, -0.03, 0.10])
 
 
 @pytest.fixture(scope="module", params=["down", "up", "along"])
-def carrying(request, rendered, way_down):
+def grasping(request, rendered, way_down):
     """A box that stands until waypoint 12 and then goes with the tool, down, up or sideways."""
     Ts = np.array(way_down)
     if request.param == "up":
@@ -303,8 +303,8 @@ def carrying(request, rendered, way_down):
 
 
 @pytest.mark.parametrize("before", [range(12), None], ids=["seen before", "held from the start"])
-def test_what_was_carried_is_found_in_the_tool_frame(carrying, robot, before):
-    demonstration = carrying
+def test_what_was_grasped_is_found_in_the_tool_frame(grasping, robot, before):
+    demonstration = grasping
     config = CloudConfig(unknown="free")
     found = grasped_object(demonstration, robot, (), range(12, len(demonstration)), before, config)
     assert len(found.points) > 30
@@ -313,8 +313,8 @@ def test_what_was_carried_is_found_in_the_tool_frame(carrying, robot, before):
     assert np.ptp(found.points[:, 0]) > SIZE[0] - 0.012
 
 
-def test_an_object_held_from_the_start_is_taken_to_be_as_deep_as_the_unknown(carrying, robot):
-    demonstration = carrying
+def test_an_object_held_from_the_start_is_taken_to_be_as_deep_as_the_unknown(grasping, robot):
+    demonstration = grasping
     after = range(12, len(demonstration))
     visible = grasped_object(demonstration, robot, (), after, config=CloudConfig(unknown="free"))
     deep = grasped_object(demonstration, robot, (), after)
@@ -334,14 +334,14 @@ def test_what_was_taken_out_of_sight_is_found_where_images_see_through(rendered,
     assert on_box(found.points, T_TOOL_BOX).all()
 
 
-def test_nothing_is_grasped_where_all_stays_or_the_tool_does_not_move(rendered, carrying, robot):
+def test_nothing_is_grasped_where_all_stays_or_the_tool_does_not_move(rendered, grasping, robot):
     still = rendered(lambda t: [BOX])
     assert grasped_object(still, robot, (), range(12, len(still)), range(12)) is None
-    assert grasped_object(carrying, robot, (), range(12, 13), range(12)) is None
+    assert grasped_object(grasping, robot, (), range(12, 13), range(12)) is None
 
 
-def test_what_was_carried_is_no_part_of_the_scene_before_or_after(carrying, robot):
-    demonstration = carrying
+def test_what_was_grasped_is_no_part_of_the_scene_before_or_after(grasping, robot):
+    demonstration = grasping
     n = len(demonstration)
     found = grasped_object(demonstration, robot, (), range(12, n), range(12))
     cloud = fuse_cloud(demonstration, robot, (), grasped=[found])

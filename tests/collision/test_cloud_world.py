@@ -72,8 +72,8 @@ def test_radii_are_no_larger_than_the_exact_ones_by_2_mm_and_mostly_nearly_as_la
 def test_spheres_from_the_cloud_tile_the_demonstration_and_say_what_limits_them(toolbox):
     annotation = suggest_annotation(toolbox.demonstration, toolbox.cloud)
     annotation.check_matches(toolbox.demonstration)
-    carrying = [bool(toolbox.cloud.phases[s.waypoint].grasped) for s in annotation.spheres]
-    assert not carrying[0] and carrying[-1]
+    grasping = [bool(toolbox.cloud.phases[s.waypoint].grasped) for s in annotation.spheres]
+    assert not grasping[0] and grasping[-1]
     reasons = {sphere.limited_by for sphere in annotation.spheres}
     assert any(reason.endswith("/ cloud") for reason in reasons)
     assert any("gripper command" in reason for reason in reasons)

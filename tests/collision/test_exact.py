@@ -101,10 +101,10 @@ def test_what_is_carried_may_move_in_the_grasp_by_its_play(picked, toolbox, firs
     tight = ExactWorld(
         picked.demonstration, get_robot(toolbox.robot), toolbox.scene, slip_tolerance=0.0
     )
-    for scene, play in ((picked, 0.005), (tight, 0.0)):
+    for scene, slip in ((picked, 0.005), (tight, 0.0)):
         placed = scene.placed(t)
         of_grasped = np.array([placed.names(k)[0] == "toolbox" for k in range(len(placed.pairs))])
-        np.testing.assert_array_equal(placed.slip, play * of_grasped)
+        np.testing.assert_array_equal(placed.slip, slip * of_grasped)
         assert not scene.placed(3).slip.any()
 
 
@@ -147,6 +147,6 @@ def test_a_scene_of_which_a_body_does_not_collide_is_refused(picked, toolbox):
     ghost = Body("ghost", (Shape("sphere", (0.1,), collides=False),))
     scene = dataclasses.replace(toolbox.scene, bodies=(*toolbox.scene.bodies, ghost))
     Ts = {**demo.body_Ts_world, "ghost": np.tile(np.eye(4), (len(demo), 1, 1))}
-    told = dataclasses.replace(demo, body_Ts_world=Ts)
+    changed = dataclasses.replace(demo, body_Ts_world=Ts)
     with pytest.raises(InvalidInput, match="body 'ghost': no shape of it collides"):
-        ExactWorld(told, get_robot(toolbox.robot), scene)
+        ExactWorld(changed, get_robot(toolbox.robot), scene)

@@ -707,12 +707,12 @@ def test_rough_distances_are_never_above_true_ones(cluttered, seed, kind, spread
 
 
 @PROPERTY
-@given(seed=seeds, grasped=st.booleans(), play=st.sampled_from([0.0, 0.02]))
-def test_rough_distances_are_never_above_true_ones_whatever_is_grasped(rods, seed, grasped, play):
+@given(seed=seeds, grasped=st.booleans(), slip=st.sampled_from([0.0, 0.02]))
+def test_rough_distances_are_never_above_true_ones_whatever_is_grasped(rods, seed, grasped, slip):
     rng = np.random.default_rng(seed)
     Ts = {"wire": random_pose(rng, 0.6), "rod": random_pose(rng, 0.6)}
     in_grasp = {"rod": random_pose(rng, 0.3)} if grasped else None
-    placed = rods.placed(Ts, rng.uniform(), in_grasp, slip_tolerance=play)
+    placed = rods.placed(Ts, rng.uniform(), in_grasp, slip_tolerance=slip)
     q = joints_near(placed, rng)
     assert_not_above(rough_distances(placed, q), placed.distances(q))
 
@@ -737,20 +737,20 @@ def test_spheres_and_boxes_enclose_what_they_stand_for(cluttered, kind, rng):
         assert (np.abs(local) <= bounds.half[k] + 1e-9).all()
 
 
-# --- play in the grasp --------------------------------------------------------------------------
+# --- slip in the grasp --------------------------------------------------------------------------
 
 
 @PROPERTY
-@given(seed=seeds, play=st.floats(0, 0.02))
-def test_all_that_is_grasped_is_nearer_by_its_play_and_nothing_else_is(rods, seed, play):
+@given(seed=seeds, slip=st.floats(0, 0.02))
+def test_all_that_is_grasped_is_nearer_by_its_slip_and_nothing_else_is(rods, seed, slip):
     rng = np.random.default_rng(seed)
     Ts, T_tool_rod = {"wire": random_pose(rng, 0.6)}, random_pose(rng, 0.3)
     tight = rods.placed(Ts, 0.2, {"rod": T_tool_rod})
-    loose = rods.placed(Ts, 0.2, {"rod": T_tool_rod}, slip_tolerance=play)
+    loose = rods.placed(Ts, 0.2, {"rod": T_tool_rod}, slip_tolerance=slip)
     q = joints_near(loose, rng)
     grasped = np.array([loose.names(k)[0] == "rod" for k in range(len(loose.pairs))])
     assert 0 < grasped.sum() < len(grasped)
-    expected = tight.distances(q) - play * grasped
+    expected = tight.distances(q) - slip * grasped
     np.testing.assert_allclose(loose.distances(q), expected, rtol=0, atol=ACCURACY)
     every = list(range(len(loose.pairs)))
     np.testing.assert_allclose(loose.pair_distances(q, every), expected, rtol=0, atol=ACCURACY)
@@ -771,18 +771,18 @@ def test_rough_distances_take_the_play_into_account():
     q = collision.robot.home
     T = collision.kinematics.fk(q)
     Ts = {"block": pose(T[:3, 3] - [0, 0, 0.2 + 0.05 + 0.5])}
-    for play in (0.0, 0.02):
-        placed = collision.placed(Ts, 0.0, {"pole": np.eye(4)}, slip_tolerance=play)
+    for slip in (0.0, 0.02):
+        placed = collision.placed(Ts, 0.0, {"pole": np.eye(4)}, slip_tolerance=slip)
         (k,) = by_names(placed)["pole", "block"]
-        assert placed.distances(q)[k] == pytest.approx(0.05 - play, abs=ACCURACY)
-        assert rough_distances(placed, q)[k] == pytest.approx(0.05 - play, abs=1e-4)
-        assert rough_distances(placed, q)[k] <= 0.05 - play + ACCURACY
+        assert placed.distances(q)[k] == pytest.approx(0.05 - slip, abs=ACCURACY)
+        assert rough_distances(placed, q)[k] == pytest.approx(0.05 - slip, abs=1e-4)
+        assert rough_distances(placed, q)[k] <= 0.05 - slip + ACCURACY
 
 
-@pytest.mark.parametrize("play", [-1e-6, np.nan, np.inf])
-def test_a_play_that_is_negative_or_not_finite_is_refused(rods, play):
+@pytest.mark.parametrize("slip", [-1e-6, np.nan, np.inf])
+def test_a_slip_tolerance_that_is_negative_or_not_finite_is_refused(rods, slip):
     with pytest.raises(InvalidInput, match="slip_tolerance: expected a finite number >= 0 m, got"):
-        rods.placed({"wire": FAR}, 0.0, {"rod": np.eye(4)}, slip_tolerance=play)
+        rods.placed({"wire": FAR}, 0.0, {"rod": np.eye(4)}, slip_tolerance=slip)
 
 
 # --- other questions ----------------------------------------------------------------------------

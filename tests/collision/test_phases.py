@@ -39,14 +39,16 @@ def test_what_stands_on_something_else_is_no_contact_of_the_robots(picked, first
 def test_before_the_first_step_all_is_as_after_it_but_for_the_gripper(picked):
     demo = picked.demonstration
     touched = (("table", "wrist_camera"),)
-    told = dataclasses.replace(
+    changed = dataclasses.replace(
         demo, touching=((), touched, *demo.touching[2:]),
         steps=dataclasses.replace(
             demo.steps,
             commanded_gripper=np.concatenate([[0.25], demo.steps.commanded_gripper[1:]]),
         ),
     )  # fmt: skip
-    first, second, *_ = demonstration_phases(told, picked.collision.robot, picked.collision.scene)
+    first, second, *_ = demonstration_phases(
+        changed, picked.collision.robot, picked.collision.scene
+    )
     assert first.contacts == second.contacts == {("table", "wrist_camera")}
     assert (first.gripper, second.gripper) == (0.25, round(demo.steps.commanded_gripper[1], 2))
 
@@ -54,12 +56,12 @@ def test_before_the_first_step_all_is_as_after_it_but_for_the_gripper(picked):
 def test_a_gripper_command_that_is_hardly_another_is_the_same_phase(picked):
     demo = picked.demonstration
     command = np.tile([0.301, 0.299], len(demo))[: len(demo)]
-    told = dataclasses.replace(
+    changed = dataclasses.replace(
         demo,
         touching=((),) * len(demo),
         steps=dataclasses.replace(demo.steps, commanded_gripper=command),
     )
-    phases = demonstration_phases(told, picked.collision.robot, picked.collision.scene)
+    phases = demonstration_phases(changed, picked.collision.robot, picked.collision.scene)
     assert set(phases) == {Phase(0.3, frozenset(), frozenset())}
 
 

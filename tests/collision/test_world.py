@@ -65,8 +65,8 @@ def test_only_what_is_known_to_move_is_reported_to(picked, first_grasp, toolbox)
     demo, robot = picked.demonstration, get_robot(toolbox.robot)
     assert picked.moving(0) is None and picked.moving(first_grasp + 5) is None
     # Carried away without being in the grasp, that is.
-    told = ExactWorld(dataclasses.replace(demo, touching=((),) * len(demo)), robot, toolbox.scene)
-    assert told.moving(first_grasp + 10) == "toolbox"
+    blind = ExactWorld(dataclasses.replace(demo, touching=((),) * len(demo)), robot, toolbox.scene)
+    assert blind.moving(first_grasp + 10) == "toolbox"
     seen = CloudWorld(demo, robot, toolbox.scene)
     assert all(seen.moving(t) is None for t in range(len(demo)))
 

@@ -1,4 +1,4 @@
-"""A dataset directory: an index, and parts that are read when asked for and told when wrong."""
+"""A dataset directory: an index, and parts that are read when asked for and refused when wrong."""
 
 from __future__ import annotations
 

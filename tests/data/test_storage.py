@@ -1,4 +1,4 @@
-"""Files: what is written is read back, what is damaged is told, what was there survives."""
+"""Files: what is written is read back, what is damaged is reported, what was there survives."""
 
 import contextlib
 import dataclasses

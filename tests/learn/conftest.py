@@ -159,7 +159,7 @@ def _with_steps(
 
 @pytest.fixture(name="open_windows")
 def _open_windows(tmp_path: Path) -> Callable[..., Windows]:
-    """`open_windows` in an empty directory each time, of the wrist camera unless told."""
+    """`open_windows` in an empty directory each time, of the wrist camera unless specified."""
 
     def opened(dataset: Dataset, image_size: int = 16, history: int = 2, **options: Any) -> Windows:
         config = WindowConfig(options.pop("cameras", ("wrist",)), image_size, history, **options)

@@ -373,7 +373,7 @@ def test_a_bound_that_is_not_positive_is_refused(name, unit, bad):
         ControllerConfig(**{name: bad})
 
 
-def test_the_lead_is_20_mm_and_5_degrees_unless_told_otherwise():
+def test_the_lead_is_20_mm_and_5_degrees_unless_specified_otherwise():
     config = ControllerConfig()
     assert (config.max_lead, config.max_lead_deg) == (0.020, 5.0)
 

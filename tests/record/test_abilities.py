@@ -76,7 +76,9 @@ def test_a_force_is_recorded_where_only_a_force_is_felt(core, peg_task, peg_mode
 
 
 def test_a_recording_that_does_not_end_says_why_its_success_is_unknown(core, peg_task, peg_model):
-    with pytest.raises(InvalidInput, match="'limited' can't tell, for want of KnowsBodies; steer"):
+    with pytest.raises(
+        InvalidInput, match="'limited' can't tell, since it lacks KnowsBodies; steer"
+    ):
         record_demonstration(
             core, peg_task, peg_model, operator(peg_task, peg_model),
             config=dataclasses.replace(BLIND, max_seconds=0.5),
@@ -105,7 +107,7 @@ def test_a_person_s_word_is_not_asked_where_the_backend_tells(peg_backend, peg_t
     session = TeleopSession(peg_backend, peg_task, peg_model, config=BLIND)
     session.start()
     session.stop()
-    with pytest.raises(InvalidInput, match="say_reached: this backend tells by itself"):
+    with pytest.raises(InvalidInput, match="say_reached: this backend itself decides"):
         session.say_reached()
 
 

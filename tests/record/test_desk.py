@@ -1,4 +1,4 @@
-"""What a person's controls do, what they are asked again, and what they are told."""
+"""What a person's controls do, what they must confirm, and what they are told."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_seconds_spent_are_kept_with_the_demonstration(
     assert saved[0].seconds == pytest.approx(9.0)
 
 
-def test_trouble_and_contact_are_told_at_once(desk, keyboard, tick_until):
+def test_trouble_and_contact_are_reported_at_once(desk, keyboard, tick_until):
     desk.press(NEXT)
     keyboard.key("3", True)
     keyboard.key("q", True)
@@ -213,13 +213,13 @@ def test_a_device_lost_before_the_start_is_asked_for_at_the_start(desk, keyboard
 
 
 def test_who_watches_is_reported_of_each_step_and_each_phase(make_session, keyboard):
-    told = []
-    desk = RecordingDesk(make_session(), keyboard, lambda _: None, told.append)
+    status = []
+    desk = RecordingDesk(make_session(), keyboard, lambda _: None, status.append)
     recorded(desk, 1.0)
     desk.press(NEXT)
-    states = [row["state"] for row in told]
+    states = [row["state"] for row in status]
     assert states[:2] == ["ready", "recording"] and states[-1] == "ended"
     assert states.count("recording") == 11
-    assert np.array(told[-1]["T_world_tool"]).shape == (4, 4)
-    seconds = [row["seconds"] for row in told]
-    assert seconds == sorted(seconds) and told[-1]["success"] is False
+    assert np.array(status[-1]["T_world_tool"]).shape == (4, 4)
+    seconds = [row["seconds"] for row in status]
+    assert seconds == sorted(seconds) and status[-1]["success"] is False

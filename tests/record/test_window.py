@@ -83,7 +83,7 @@ def press(pygame, key, *kinds):
         pygame.event.post(pygame.event.Event(kind, key=key))
 
 
-def test_events_are_told_by_the_names_of_keys(pygame, screen):
+def test_events_have_the_names_of_keys(pygame, screen):
     press(pygame, pygame.K_RIGHT, pygame.KEYDOWN)
     press(pygame, pygame.K_w, pygame.KEYUP)
     pygame.event.post(pygame.event.Event(pygame.WINDOWFOCUSLOST))

@@ -1,4 +1,4 @@
-"""Kinematics: IK inverts FK within joint limits, and what can't be answered is told."""
+"""Kinematics: IK inverts FK within joint limits, and what can't be answered is refused."""
 
 import dataclasses
 

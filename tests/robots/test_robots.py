@@ -1,4 +1,4 @@
-"""The table of robots: each one loads under its name, another name is told with the nearest."""
+"""The table of robots: each one loads under its name, another name is refused with the nearest."""
 
 import pytest
 

@@ -74,7 +74,7 @@ def probed(peg_task, peg_model):
 
 
 def place(points, gripper=0.0, grasped=None, **Ts_world_body):
-    """Put bodies somewhere, those not told of far away."""
+    """Put bodies somewhere, those not given far away."""
     far = {b.name: pose([5.0 + i, 5, 5]) for i, b in enumerate(points.scene.bodies)}
     points.place({**far, **Ts_world_body}, gripper, grasped or {})
 
@@ -518,7 +518,7 @@ def test_joints_that_are_no_configuration_are_refused(peg, q):
             ask(q[None])
 
 
-def test_bodies_and_links_that_are_not_there_are_told(peg):
+def test_bodies_and_links_that_are_missing_are_reported(peg):
     with pytest.raises(UnknownName, match="unknown body 'block': did you mean 'blok'"):
         peg.place({"table": np.eye(4), "blok": np.eye(4)}, 0.0)
     with pytest.raises(UnknownName, match="unknown body 'blok': did you mean 'block'"):

@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 EXAMPLES = HERE.parents[1] / "docs" / "examples"
 
 
-def _told(outcome):
+def _summary(outcome):
     return "\n\n".join(f"{test}: {message}" for test, message in outcome.failed.items())
 
 
@@ -30,7 +30,7 @@ def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
         pytest.skip(str(error))
     made.close()
     outcome = run_suite([backend], robot)[backend]
-    assert not outcome.failed, _told(outcome)
+    assert not outcome.failed, _summary(outcome)
     if os.environ.get("SART_NO_IMAGES"):
         assert all("lacks images" in reason for reason in outcome.skipped.values())
     else:
@@ -59,7 +59,7 @@ def test_a_backend_with_some_abilities_or_none_keeps_the_rest_of_the_contract(
     """The example of one's own backend, and the bare core of it."""
     name = str(name)
     outcome = run_suite([name], "ur5e_2f85")[name]
-    assert not outcome.failed, _told(outcome)
+    assert not outcome.failed, _summary(outcome)
     assert outcome.passed >= 24
     reasons = {reason.split("lacks ")[1] for reason in outcome.skipped.values()}
     assert reasons == lacking

@@ -34,7 +34,7 @@ SPEEDS = (Speed("slow", 0.02, 8.0), Speed("normal", 0.06, 25.0), Speed("fast", 0
 
 
 class Control(enum.Enum):
-    """What a person tells the recording, beside steering."""
+    """What a person asks of the recording, beside steering."""
 
     NEXT = "next"
     REDO = "redo"
@@ -89,8 +89,8 @@ def _axes(right: Array, up: Array) -> Array:
 class ManualDevice(Device):
     """A device in a person's hand.
 
-    A subclass tells by `poll` how the hand pushes and turns; speed, frame, smoothness and gripper
-    are seen to here, as are the keys that work whatever one steers with.
+    A subclass returns from `poll` how the hand pushes and turns; speed, frame, smoothness and
+    gripper are handled here, as are the keys that work with every device.
 
     Attributes:
         speed: one of `SPEEDS`.

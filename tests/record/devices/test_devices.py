@@ -36,7 +36,7 @@ def test_an_unknown_device_is_refused_with_the_nearest(peg_setup):
 
 
 class Puppet(ManualDevice):
-    """Pushes and turns as told."""
+    """Pushes and turns as set."""
 
     name = "puppet"
     axes = np.zeros(6)
@@ -205,7 +205,7 @@ def test_an_unknown_frame_is_refused(peg_setup):
         Puppet(dataclasses.replace(peg_setup, frame="base"))
 
 
-def test_controls_are_told_once(puppet):
+def test_controls_are_reported_once(puppet):
     puppet._controls.append(Control.NEXT)
     assert puppet.controls() == [Control.NEXT] and puppet.controls() == []
 
