@@ -291,7 +291,7 @@ class AnnotationWindow:
                 scene.show_geometry(rings, False)
                 continue
             sphere = session.spheres[i]
-            # Glass is dear on a CPU: only the sphere at hand is made of it.
+            # Transparency is expensive on a CPU: only the current sphere has it.
             style = session.verdict(sphere).word, sphere is session.governing
             if self._drawn.get(i) != style:
                 colour, glass = _COLOURS[style[0]], style[1]
@@ -308,7 +308,7 @@ class AnnotationWindow:
                 scene.set_geometry_transform(name, T)
 
     def _draw_governing(self) -> None:
-        """Convergence waypoint and sampled poses of the sphere at hand, and the labels."""
+        """Convergence waypoint and sampled poses of the current sphere, and the labels."""
         session, scene = self._session, self._view.scene
         for label in self._labels:
             self._view.remove_3d_label(label)

@@ -126,7 +126,7 @@ class AnnotationSession:
         """Begin with an annotation's spheres or with none, and with what a journal has kept.
 
         Args:
-            demonstration: what was shown.
+            demonstration: the recorded demonstration.
             world: where the obstacles are.
             config: what the keys do.
             annotation: the one to continue.

@@ -224,7 +224,7 @@ def suggest_radius(
 
     Args:
         world: where the obstacles are.
-        demonstration: what was shown.
+        demonstration: the recorded demonstration.
         t: the key waypoint.
         config: margins and limits.
 
@@ -459,7 +459,7 @@ def suggest_annotation(
     grasp, release or contact; an object in the grasp counts as part of the tool.
 
     Args:
-        demonstration: what was shown.
+        demonstration: the recorded demonstration.
         world: where the obstacles were.
         waypoints: key waypoints, or `None` to choose them.
         config: margins and limits.

@@ -173,7 +173,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Play:
-    """Look at a demonstration or an episode again, in a window or as an MP4 film.
+    """Look at a demonstration or an episode again, in a window or as an MP4 video.
 
     Example: sart play demo.h5
 

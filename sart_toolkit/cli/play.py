@@ -1,4 +1,4 @@
-"""`sart play`: which recording a path names, and window or film."""
+"""`sart play`: which recording a path names, and window or video."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def check_play_options(args: Play) -> None:
     """Refuse what can't be done before anything is drawn.
 
     Raises:
-        InvalidInput: the speed is not positive, or the film's name doesn't end in .mp4.
-        OutputExists, CannotWrite: the film can't be written.
+        InvalidInput: the speed is not positive, or the video's name doesn't end in .mp4.
+        OutputExists, CannotWrite: the video can't be written.
     """
     check_positive("speed", args.speed)
     if args.out is not None:
@@ -91,7 +91,7 @@ def check_play_options(args: Play) -> None:
 
 
 def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, Any]:
-    """What was played: in a window until it was closed, or into a film."""
+    """What was played: in a window until it was closed, or into a video."""
     said = {
         "played": str(args.file),
         "kind": "episode" if playback.split else "demonstration",
@@ -117,4 +117,4 @@ def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, A
                 progress("play", i, len(playback))
 
         write_video(args.out, counted(), playback.hz * args.speed)
-    return said | {"film": str(args.out)}
+    return said | {"video": str(args.out)}

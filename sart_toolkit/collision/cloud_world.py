@@ -55,7 +55,7 @@ class CloudWorld(CollisionWorld):
         """Take the images of a demonstration; they are processed when a waypoint is asked about.
 
         Args:
-            demonstration: what was shown and seen.
+            demonstration: the recorded demonstration.
             robot: the robot that was steered.
             scene: says what is fixed to the robot and which bodies can be lifted; where its bodies
                 are and what shape they have is not used.

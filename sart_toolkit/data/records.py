@@ -350,7 +350,7 @@ class Demonstration(Referring):
         )
 
     def content_hash(self) -> str:
-        """SHA-256 over what was shown: steps, bodies, commands, task, robot; not saved states."""
+        """SHA-256 over the recording: steps, bodies, commands, task, robot; not saved states."""
         return digest(
             {
                 **self.steps.content(),

@@ -50,7 +50,7 @@ class Moment:
     success: bool
 
 
-# Makes a film, at a path, of a rollout's moments at a rate [1/s], its number and its outcome.
+# Makes a video, at a path, of a rollout's moments at a rate [1/s], its number and its outcome.
 Film = Callable[[Path, Sequence[Moment], float, int, Literal["success", "failure"]], object]
 
 

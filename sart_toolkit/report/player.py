@@ -42,7 +42,7 @@ class Playback:
 
     Attributes:
         title: what is played.
-        demonstration: what was shown, or what the episode was made from.
+        demonstration: the recorded one, or what the episode was made from.
         split: how many waypoints come from the episode; 0 for a demonstration.
         camera: the recorded camera whose images are shown; another of them may be set.
     """
@@ -57,7 +57,7 @@ class Playback:
 
         Args:
             title: what it is called.
-            demonstration: what was shown.
+            demonstration: the recorded demonstration.
             episode: its segment is played first, then the demonstration from `t_star`.
 
         Raises:

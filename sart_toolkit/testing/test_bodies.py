@@ -85,7 +85,7 @@ def test_restore_returns_free_bodies(loose: Bench) -> None:
     np.testing.assert_array_equal(_brick(loose), before)
 
 
-def test_a_falling_body_goes_on_falling_after_a_restore(loose: Bench) -> None:
+def test_a_falling_body_keeps_falling_after_a_restore(loose: Bench) -> None:
     """Velocities are part of the state."""
     loose.needs(SavesStates)
     loose.reset(Ts_world_body=_lifted(loose, 0.5))
@@ -279,7 +279,7 @@ def test_restore_returns_jointed_bodies(jointed: Bench) -> None:
     assert jointed.positions() == before
 
 
-def test_a_swinging_body_goes_on_swinging_after_a_restore(jointed: Bench) -> None:
+def test_a_swinging_body_keeps_swinging_after_a_restore(jointed: Bench) -> None:
     """Joint velocities are part of the state."""
     jointed.needs(SavesStates)
     jointed.wait(0.3)

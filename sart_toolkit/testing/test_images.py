@@ -204,7 +204,7 @@ def _moved_ball(bench: Bench) -> SceneState:
     return bench.state(bench.ready + 0.1, Ts_world_body={"ball": place})
 
 
-def test_a_drawn_state_looks_like_the_state(view: Bench) -> None:
+def test_a_drawn_state_appears_as_the_state_does(view: Bench) -> None:
     """As an image of the same state after a reset does."""
     view.needs(Draws, Resets)
     state = _moved_ball(view)

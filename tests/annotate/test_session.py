@@ -433,7 +433,7 @@ def test_a_journal_done_again_equals_the_live_state(open_session, tmp_path, acti
             assert rows(live) == rows(replayed)
 
 
-def test_an_interrupted_session_goes_on_and_says_so(session, open_session, tmp_path):
+def test_an_interrupted_session_resumes_and_says_so(session, open_session, tmp_path):
     session._clock.now = 30.0
     press(session, "A", "Right", "Backspace", "Home", "Up")
     again = open_session()

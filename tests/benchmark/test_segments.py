@@ -133,7 +133,7 @@ def test_contacts_and_paths_that_were_left_are_told_apart_from_other_rejections(
     assert [sphere["rejections"] for sphere in row["spheres"]] == [{o: 1} for o in outcomes]
 
 
-def test_a_law_that_heeds_no_limits_is_found(
+def test_a_timing_that_ignores_limits_is_found(
     tmp_path: Path, peg_cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original = timing._timing

@@ -59,7 +59,7 @@ def _short_rollouts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_short_rollouts")
-def test_whole_run_leaves_every_result_and_goes_on_where_it_was(
+def test_whole_run_leaves_every_result_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"

@@ -763,7 +763,7 @@ def test_all_that_is_grasped_is_nearer_by_its_slip_and_nothing_else_is(rods, see
         assert loose.too_close(q, max(margin - 2e-4, 0.0)) is None or expected.min() < 0
 
 
-def test_rough_distances_take_the_play_into_account():
+def test_rough_distances_take_the_slip_into_account():
     # A pole that points at the middle of a block: the sphere about it is hardly nearer.
     collision = simple(
         ("pole", Shape("box", (1e-3, 1e-3, 0.4))), ("block", Shape("box", (1, 1, 1)))

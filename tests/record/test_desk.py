@@ -126,7 +126,7 @@ def test_much_is_thrown_away_only_when_asked_twice(desk, saved, end_first):
     assert desk.done and not saved and desk.demonstration is None
 
 
-def test_after_a_discard_that_was_not_meant_it_goes_on(desk):
+def test_after_a_discard_that_was_not_meant_it_resumes(desk):
     recorded(desk, 4.0)
     desk.press(DISCARD)
     desk.press(NEXT)
@@ -135,7 +135,7 @@ def test_after_a_discard_that_was_not_meant_it_goes_on(desk):
     assert not desk.done, "asked again"
 
 
-def test_a_save_that_fails_loses_nothing_and_can_be_tried_again(
+def test_a_save_that_fails_loses_nothing_and_can_be_repeated(
     make_session, keyboard, tick_until, ended
 ):
     full, saved = [True], []

@@ -332,7 +332,7 @@ def test_durations_read_naturally(seconds: float, words: str) -> None:
     assert duration(seconds).replace("\N{NO-BREAK SPACE}", " ") == words
 
 
-def test_shares_read_naturally() -> None:
+def test_percentages_read_naturally() -> None:
     shares = [percent(share).replace("\N{NO-BREAK SPACE}", " ") for share in (0, 0.8, 0.9287, 1)]
     assert shares == ["0 %", "80 %", "92.9 %", "100 %"]
 
