@@ -205,7 +205,7 @@ class SavesStates(abc.ABC):
 
 
 class SensesForce(abc.ABC):
-    """Can feel how hard it is pressed."""
+    """Senses the contact force."""
 
     @abc.abstractmethod
     def force(self) -> float:

@@ -41,7 +41,7 @@ _IMAGE = Annotated[
     str, arg(help="Size of recorded images [pixels]: 128, or width and height as in 160x120.")
 ]
 _CAMERAS = Annotated[
-    str, arg(help="Cameras to record and learn from, with commas between, such as wrist,overview.")
+    str, arg(help="Cameras to record and learn from, comma-separated, such as wrist,overview.")
 ]
 _DEVICE = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Where the policy runs.")]
 _STRATEGY = Annotated[
@@ -58,17 +58,17 @@ _POLICY = Annotated[
 ]
 _N = Annotated[int, arg(help="Trajectories in all, the demonstration among them.")]
 _EPISODES = Annotated[int, arg(help="Rollouts with random placements.")]
-_EVAL_SEED = Annotated[int, arg(help="Seed of the placements, apart from training's.")]
+_EVAL_SEED = Annotated[int, arg(help="Seed of the placements, separate from training's.")]
 _YAW = Annotated[
     float, arg(help="Also turn the object, uniformly within ± this [deg]; the paper does not.")
 ]
 _APPEARANCE = Annotated[
     bool, arg(help="Vary colours, light and the wrist camera's mounting at random.")
 ]
-_TASKS = Annotated[str, arg(help="Names of tasks with commas between, or all.")]
-_BACKENDS = Annotated[str, arg(help="Names of backends with commas between, or all.")]
+_TASKS = Annotated[str, arg(help="Comma-separated names of tasks, or all.")]
+_BACKENDS = Annotated[str, arg(help="Comma-separated names of backends, or all.")]
 _SLIP_TOLERANCE = Annotated[
-    float, arg(help="How far what is grasped may move in the grasp [m]; so much more is kept free.")
+    float, arg(help="In-grasp slip tolerance [m]: so much more is kept clear of a grasped object.")
 ]
 _SOURCE = Annotated[
     Literal["scene", "cloud"],
@@ -78,9 +78,9 @@ _UNKNOWN = Annotated[
     Literal["behind", "free"],
     arg(help="With --source cloud: space behind what was seen counts as solid, or as free."),
 ]
-_TOOL_MARGIN = Annotated[float, arg(help="Distance that stays free of the tool everywhere [m].")]
-_MIN_RADIUS = Annotated[float, arg(help="Smallest sphere worth having [m].")]
-_MAX_RADIUS = Annotated[float, arg(help="Largest sphere [m].")]
+_TOOL_MARGIN = Annotated[float, arg(help="Distance kept free around the tool [m].")]
+_MIN_RADIUS = Annotated[float, arg(help="Smallest radius of a sphere [m].")]
+_MAX_RADIUS = Annotated[float, arg(help="Largest radius of a sphere [m].")]
 _DISTRIBUTION = Annotated[
     Literal["paper", "area"],
     arg(help="How positions are drawn on a sphere: as the paper says, or uniform over its area."),
@@ -136,7 +136,10 @@ class Record:
     task: _TASK
     out: Annotated[Path, arg(help="HDF5 file to write.")]
     device: Annotated[
-        str, arg(metavar="REF", help="What steers: keyboard, spacemouse, gamepad, or scripted.")
+        str,
+        arg(
+            metavar="REF", help="What steers: keyboard, spacemouse, gamepad, scripted, or your own."
+        ),
     ] = "scripted"
     backend: _BACKEND = "pybullet"
     robot: _ROBOT = None
@@ -191,7 +194,7 @@ class Play:
     camera: Annotated[
         str, arg(help="A camera of the scene, drawn again; or a recorded one, such as wrist.")
     ] = "overview"
-    speed: Annotated[float, arg(help="Times real time.")] = 1.0
+    speed: Annotated[float, arg(help="Playback speed; 1 is real time.")] = 1.0
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
     backend: _NOTED_BACKEND = None
@@ -428,7 +431,9 @@ class BenchmarkOperator:
 
     tasks: _TASKS = "all"
     backends: _BACKENDS = "all"
-    episodes: Annotated[int, arg(help="Episodes with random placements, a task and backend.")] = 100
+    episodes: Annotated[
+        int, arg(help="Episodes with random placements, for each task and backend.")
+    ] = 100
     seed: _SEED = 0
     yaw_deg: _YAW = 0.0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_operator.json")
@@ -497,7 +502,7 @@ class BenchmarkRadii:
     tasks: _TASKS = "all"
     backends: _BACKENDS = "pybullet"
     draws: Annotated[int, arg(help="Random poses in each sphere.")] = 2000
-    directed: Annotated[int, arg(help="Draws that aim, in each grown sphere.")] = 20_000
+    directed: Annotated[int, arg(help="Directed draws in each enlarged sphere.")] = 20_000
     seed: _SEED = 0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_radii.json")
     workers: _WORKERS = 2
