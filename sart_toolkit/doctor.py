@@ -27,7 +27,7 @@ _SUDO = "" if os.geteuid() == 0 else "sudo "
 
 
 class ProbeFailed(SartError, RuntimeError):
-    """Something that the doctor tried out does not do what it should."""
+    """Something that the doctor tested does not do what it should."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class Finding:
     """One answer of the doctor.
 
     Attributes:
-        name: what was looked at.
+        name: what was checked.
         ok: whether it works.
         detail: what was found, or what went wrong.
         remedy: what to do about it; empty where `ok`.
-        required: whether the toolkit is of no use without it.
-        tried: whether it was tried out, and not only found to be installed.
+        required: whether the toolkit is useless without it.
+        tested: whether it was tested, and not only found to be installed.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Finding:
     detail: str
     remedy: str = ""
     required: bool = False
-    tried: bool = True
+    tested: bool = True
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,11 @@ class Probe:
     """One question to the machine, asked in a process of its own.
 
     Attributes:
-        name: what is looked at.
+        name: what is checked.
         target: `module:function`; the function returns what it found, or raises.
         extra: the extra of sart_toolkit that it belongs to; empty for the core.
         remedy: what to do where the function fails, other than for a missing package or library.
-        required: whether the toolkit is of no use without it.
+        required: whether the toolkit is useless without it.
         timeout_s: how long it may take [s].
         packages: for an answer without trying: the installed packages that it needs.
     """
@@ -77,9 +77,9 @@ class Probe:
 def diagnose(full: bool = True) -> list[Finding]:
     """What works on this machine, required things first.
 
-    Simulators and renderers are tried out for real, each in a process of its own, so that one
-    that crashes or hangs is a finding and not the end of the doctor. Unless `full`, of what is not
-    required it is only looked up whether it is installed.
+    Simulators and renderers are really run, each in a process of its own, so that one
+    that crashes or hangs is a finding and not the end of the doctor. Unless `full`, what is
+    not required is only checked to be installed.
     """
     probe = run_probe if full else _quick_finding
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
@@ -94,7 +94,7 @@ def _quick_finding(probe: Probe) -> Finding:
         return _broken(
             probe, f"{probe.packages[0]} is not installed", _remedy(probe, "ModuleNotFoundError")
         )
-    return Finding(probe.name, True, f"{_version(*probe.packages)}, not tried", tried=False)
+    return Finding(probe.name, True, f"{_version(*probe.packages)}, not tested", tested=False)
 
 
 def _is_installed(package: str) -> bool:
@@ -138,7 +138,7 @@ _CHILD = "import sys; from sart_toolkit.doctor import answer; answer(sys.argv[1]
 
 
 def answer(target: str, answer_file: str) -> None:
-    """Runs in the probe's process: calls `module:function` and writes what came of it as JSON."""
+    """Runs in the probe's process: calls `module:function` and writes the result as JSON."""
     module, _, function = target.partition(":")
     try:
         detail = getattr(importlib.import_module(module), function)()
@@ -229,14 +229,14 @@ def probe_pybullet() -> str:
         pybullet.stepSimulation()
     height = pybullet.getBasePositionAndOrientation(ball)[0][2]
     _check_fall(height)
-    picture = pybullet.getCameraImage(
+    image = pybullet.getCameraImage(
         32,
         32,
         pybullet.computeViewMatrix([1, 0, height], [0, 0, height], [0, 0, 1]),
         pybullet.computeProjectionMatrixFOV(60, 1, 0.01, 5),
         renderer=pybullet.ER_TINY_RENDERER,
     )
-    _check_picture(bool((np.asarray(picture[4]) == ball).any()))
+    _check_image(bool((np.asarray(image[4]) == ball).any()))
     pybullet.disconnect(client)
     return f"{_version('pybullet')}, simulates and draws"
 
@@ -270,7 +270,7 @@ def probe_sapien_rendering() -> str:
     camera.entity.set_pose(sapien.Pose([-1, 0, 0]))
     scene.update_render()
     camera.take_picture()
-    _check_picture(bool((camera.get_picture("Segmentation")[..., 1] == ball.per_scene_id).any()))
+    _check_image(bool((camera.get_picture("Segmentation")[..., 1] == ball.per_scene_id).any()))
     return f"draws on {sapien.render.RenderSystem().device.name}"
 
 
@@ -288,7 +288,7 @@ def probe_open3d_offscreen() -> str:
     ball = open3d.geometry.TriangleMesh.create_sphere(0.2)
     renderer.scene.add_geometry("ball", ball, material)
     renderer.setup_camera(60.0, [0, 0, 0], [1, 0, 0], [0, 0, 1])
-    _check_picture(bool(np.ptp(np.asarray(renderer.render_to_image())) > 0))
+    _check_image(bool(np.ptp(np.asarray(renderer.render_to_image())) > 0))
     return f"{_version('open3d-cpu', 'open3d')}, draws"
 
 
@@ -411,9 +411,9 @@ def _check_fall(height: float) -> None:
         raise ProbeFailed(f"a ball dropped from 1 m is at {height:.3f} m after 0.25 s, not 0.693")
 
 
-def _check_picture(shows_ball: bool) -> None:
+def _check_image(shows_ball: bool) -> None:
     if not shows_ball:
-        raise ProbeFailed("a picture of a ball does not show it")
+        raise ProbeFailed("an image of a ball does not show it")
 
 
 def _version(*packages: str) -> str:

@@ -1,4 +1,4 @@
-"""The stages from a demonstration to a report, and all of them in a row: what `sart` calls.
+"""The stages from a demonstration to a report, and all of them in sequence: what `sart` calls.
 
 Robots, tasks, backends, strategies and policies are given as names, references (see `registry`) or
 objects. Later stages find those of a recording by the references that it holds, unless others are
@@ -80,7 +80,7 @@ Kind = Literal["robot", "task", "backend"]
 
 
 class Progress(Protocol):
-    """Hears how far a stage is: its name, what is done of the total (if known), and a few words."""
+    """Called with a stage's name, what is done of the total (if known), and a few words."""
 
     def __call__(
         self, stage: str, done: float, total: float | None = None, text: str = "", /
@@ -124,38 +124,38 @@ def noted(
 Found = TypeVar("Found")
 
 
-def _find(shown: Referring, kind: Kind, given: Any, get: Callable[[Any], Found]) -> Found:
+def _find(source: Referring, kind: Kind, given: Any, get: Callable[[Any], Found]) -> Found:
     """What is given, or else what a recording notes."""
     if given is not None:
         return get(given)
     try:
-        return get(shown.reference(kind))
+        return get(source.reference(kind))
     except UnknownName as error:
         raise UnknownName(
             f"{error}; it is what the recording notes: name another with --{kind} REF"
         ) from error
 
 
-def task_of(shown: Referring, task: TaskLike | None = None) -> Task:
+def task_of(source: Referring, task: TaskLike | None = None) -> Task:
     """The task of a recording or skill, or the one given.
 
     Raises:
         UnknownName: it can't be found.
     """
-    return _find(shown, "task", task, get_task)
+    return _find(source, "task", task, get_task)
 
 
-def robot_of(shown: Referring, robot: RobotLike | None = None) -> RobotSpec:
+def robot_of(source: Referring, robot: RobotLike | None = None) -> RobotSpec:
     """The robot of a recording or skill, or the one given.
 
     Raises:
         UnknownName: it can't be found.
     """
-    return _find(shown, "robot", robot, get_robot)
+    return _find(source, "robot", robot, get_robot)
 
 
 def backend_maker(
-    shown: Referring,
+    source: Referring,
     image_size: ImageSize,
     rates: Rates = DEFAULT_RATES,
     task: TaskLike | None = None,
@@ -167,13 +167,13 @@ def backend_maker(
     Raises:
         UnknownName: the robot, the task or the backend can't be found.
     """
-    scene = task_of(shown, task).scene
-    made = _find(shown, "backend", backend, get_backend)
-    return functools.partial(make_backend, made, robot_of(shown, robot), scene, image_size, rates)
+    scene = task_of(source, task).scene
+    made = _find(source, "backend", backend, get_backend)
+    return functools.partial(make_backend, made, robot_of(source, robot), scene, image_size, rates)
 
 
 def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
-    """Width and height of its pictures [pixels].
+    """Width and height of its images [pixels].
 
     Raises:
         InvalidInput: it holds none.
@@ -181,11 +181,11 @@ def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
     for camera in demonstration.steps.cameras.values():
         height, width = camera.rgb.shape[1:3]
         return width, height
-    raise InvalidInput("the demonstration holds no pictures; record it with a camera")
+    raise InvalidInput("the demonstration holds no images; record it with a camera")
 
 
 def _image_size_of_skill(skill: SkillConfig) -> tuple[int, int]:
-    """Width and height [pixels] of the pictures that a skill was shown."""
+    """Width and height [pixels] of the images that a skill was shown."""
     height, width = skill.cameras[skill.training.cameras[0]].size
     return width, height
 
@@ -214,7 +214,7 @@ def record(
     max_seconds: float = 120.0,
     placement: Literal["middle", "random"] = "middle",
     yaw_deg: float = 0.0,
-    vary_looks: bool = False,
+    vary_appearance: bool = False,
     cameras: Sequence[str] = ("wrist",),
     image_size: ImageSize = 128,
     seed: int = 0,
@@ -229,19 +229,19 @@ def record(
         robot: the task's own if left out.
         backend: where it is shown.
         device: what steers.
-        steer: follows a device that a person holds, and saves what came of it.
+        steer: follows a device that a person holds, and saves the recording.
         by_hand: flags that mean nothing to any other device, which are refused with one.
         frame: what a person's directions are fixed to at first.
         operator: who steers, where it is a person.
         max_seconds: the longest it may take [s].
         placement: where the object stands in its range.
         yaw_deg: a random placement is also turned within ± this [deg].
-        vary_looks: whether colours, light and the wrist camera's mounting vary.
-        cameras: whose pictures are recorded.
-        image_size: width and height of pictures [pixels]; one number for a square.
+        vary_appearance: whether colours, light and the wrist camera's mounting vary.
+        cameras: whose images are recorded.
+        image_size: width and height of images [pixels]; one number for a square.
         seed: of all that is random.
         overwrite: whether `out` may be replaced.
-        progress: hears of the seconds recorded.
+        progress: called with the seconds recorded.
 
     Raises:
         UnknownName: a name or reference leads to nothing.
@@ -256,7 +256,7 @@ def record(
     check_writable(out, overwrite)
     from sart_toolkit.record.session import DeviceSetup, SessionConfig, record_demonstration
     from sart_toolkit.robots.model import RobotModel
-    from sart_toolkit.scenes.appearance import vary_appearance
+    from sart_toolkit.scenes.appearance import randomise_appearance
     from sart_toolkit.tasks.task import Placement
 
     found = get_task(task)
@@ -273,8 +273,8 @@ def record(
         max_seconds,
         references={k: v for k, v in references.items() if v is not None},
     )
-    if vary_looks:
-        spec, scene = vary_appearance(spec, scene, np.random.default_rng([seed, 1]))
+    if vary_appearance:
+        spec, scene = randomise_appearance(spec, scene, np.random.default_rng([seed, 1]))
     with closing(make_backend(backend, spec, scene, size)) as made:
         model = RobotModel(made.robot, made.scene.held)
         setup = DeviceSetup(
@@ -309,7 +309,7 @@ def world_of(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
 ) -> CollisionWorld:
-    """Where the obstacles of a demonstration are, from its scene or from its pictures alone."""
+    """Where the obstacles of a demonstration are, from its scene or from its images alone."""
     from sart_toolkit.collision.cloud import CloudConfig
     from sart_toolkit.collision.world import make_world
 
@@ -343,7 +343,7 @@ def suggest(
         slip_tolerance: how far what is grasped may move in the grasp [m].
         task, robot: in place of those that the demonstration notes.
         overwrite: whether `out` may be replaced.
-        progress: hears of the waypoints done.
+        progress: called with the waypoints done.
         options: of `SuggestConfig`.
 
     Raises:
@@ -390,7 +390,7 @@ def augment(
         task, robot, backend: in place of those that the demonstration notes.
         workers: processes.
         overwrite: whether `out` may be replaced.
-        progress: hears of the trajectories kept.
+        progress: called with the trajectories kept.
         options: of `AugmentConfig`.
 
     Raises:
@@ -426,7 +426,7 @@ def validate(
     Args:
         dataset: directory from `augment`.
         task, robot: in place of those that its demonstration notes.
-        progress: hears of the episodes done.
+        progress: called with the episodes done.
 
     Raises:
         MissingFile, BrokenFile, Mismatch: as `validate_dataset`.
@@ -458,7 +458,7 @@ def train_policy(
         out: directory to write; an interrupted training resumes.
         policy: what is trained.
         overwrite: whether a skill in `out` may be replaced.
-        progress: hears of the steps done.
+        progress: called with the steps done.
         options: of `TrainConfig`; the policy's own where left out or None.
 
     Raises:
@@ -503,7 +503,7 @@ def evaluate(
     progress: Progress = _silent,
     **options: Any,
 ) -> dict[str, Any]:
-    """How a skill's directory fares on random placements, saved in the file `out`.
+    """How well a skill's directory performs on random placements, saved in the file `out`.
 
     Args:
         skill: the skill.
@@ -512,7 +512,7 @@ def evaluate(
         workers: processes.
         device: where the policy runs.
         overwrite: whether `out` may be replaced.
-        progress: hears of the rollouts done.
+        progress: called with the rollouts done.
         options: of `EvaluateConfig`.
 
     Raises:
@@ -538,11 +538,11 @@ def evaluate(
 
         film = film_rollout
 
-    def hear(done: int, wanted: int, successes: int) -> None:
+    def report_progress(done: int, wanted: int, successes: int) -> None:
         progress("evaluate", done, wanted, f"{successes}/{done} succeeded")
 
     return evaluate_skill(
-        skill, task_of(about, task), make, config, out, workers, device, hear, film
+        skill, task_of(about, task), make, config, out, workers, device, report_progress, film
     )
 
 
@@ -607,15 +607,15 @@ def run(
         episodes: rollouts with random placements.
         epochs: of training, the policy's own if None.
         distribution: how positions are drawn on a sphere.
-        cameras: whose pictures are recorded and trained on.
-        image_size: width and height of recorded pictures [pixels]; one number for a square.
+        cameras: whose images are recorded and trained on.
+        image_size: width and height of recorded images [pixels]; one number for a square.
         seed: of all that is random, except evaluation.
         eval_seed: of the placements that are evaluated.
         workers: processes.
         device: where training and the policy run: "auto", "cpu" or "cuda".
         overwrite: whether a run in `out` may be replaced.
         command: how it was asked for, kept with the run.
-        progress: hears of each stage.
+        progress: called with the progress of each stage.
 
     Raises:
         UnknownName: a name or reference leads to nothing.

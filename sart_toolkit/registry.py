@@ -82,7 +82,8 @@ def check_known(kind: str, reference: Any, table: Mapping[str, str]) -> None:
     if place.endswith(".py"):
         if not Path(place).is_file():
             raise UnknownName(
-                f"{kind} {reference!r}: no file {place} from {Path.cwd()}; be where it is"
+                f"{kind} {reference!r}: no file {place} from {Path.cwd()}; "
+                "pass a path that exists, or change to its folder"
             )
     else:
         _import_from_here()

@@ -28,7 +28,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement, Task
 
-PICTURE_SIZE = 48
+IMAGE_SIZE = 48
 
 # The files that take longest are begun first: at the end, one process would wait for another.
 LONGEST = (
@@ -110,7 +110,7 @@ def peg_task() -> Task:
 def make_peg_backend(peg_task: Task) -> Callable[[], Backend]:
     """Makes the robot in the peg-in-hole scene; picklable."""
     robot = get_robot(peg_task.robot)
-    return functools.partial(make_backend, "pybullet", robot, peg_task.scene, PICTURE_SIZE)
+    return functools.partial(make_backend, "pybullet", robot, peg_task.scene, IMAGE_SIZE)
 
 
 @pytest.fixture(scope="session")
@@ -132,8 +132,8 @@ def peg_demonstration(
 ) -> Demonstration:
     """The scripted operator's demonstration with seed 0, the hole in the middle."""
     backend = make_peg_backend()
-    stages = peg_task.plan(peg_task.initial_state(peg_model, Placement()))
-    operator = ScriptedOperator(stages, np.random.default_rng(0))
+    plan = peg_task.plan(peg_task.initial_state(peg_model, Placement()))
+    operator = ScriptedOperator(plan, np.random.default_rng(0))
     demonstration = record_demonstration(backend, peg_task, peg_model, operator, seed=0)
     backend.close()
     return demonstration

@@ -29,7 +29,7 @@ def made_up_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "made_up.py"
 
 
-def test_everything_is_looked_at(findings: list[Finding]) -> None:
+def test_everything_is_checked(findings: list[Finding]) -> None:
     assert {finding.name for finding in findings} == {
         "Python",
         "kinematics",
@@ -60,17 +60,17 @@ def test_what_the_tests_run_on_works_and_comes_first(findings: list[Finding]) ->
     assert [finding for finding in required if not finding.ok] == []
 
 
-def test_a_quick_look_tries_only_what_is_required() -> None:
+def test_a_quick_check_tests_only_what_is_required() -> None:
     started = time.monotonic()
     findings = diagnose(full=False)
     assert time.monotonic() - started < 20.0
-    assert {finding.required for finding in findings if finding.tried} == {True}
-    looked_for = {finding.name: finding for finding in findings if not finding.tried}
-    assert "CUDA" in looked_for and "SAPIEN rendering" in looked_for
-    assert looked_for["CUDA"].detail == f"torch {torch.__version__}, not tried"
+    assert {finding.required for finding in findings if finding.tested} == {True}
+    untested = {finding.name: finding for finding in findings if not finding.tested}
+    assert "CUDA" in untested and "SAPIEN rendering" in untested
+    assert untested["CUDA"].detail == f"torch {torch.__version__}, not tested"
 
 
-def test_a_quick_look_tells_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_quick_check_reports_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     probe = Probe("made up", "made_up:probe", extra="sapien", packages=("no-such", "nor-such"))
     monkeypatch.setattr(doctor, "PROBES", (probe,))
     (finding,) = [f for f in diagnose(full=False) if f.name == "made up"]
@@ -161,7 +161,9 @@ def test_a_read_only_folder_is_not_ok(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "can't be written" in disk.detail
 
 
-def test_torch_without_cuda_is_told_from_a_missing_device(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torch_without_cuda_is_reported_from_a_missing_device(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(torch.version, "cuda", None)
     with pytest.raises(ProbeFailed, match="built without CUDA"):
         doctor.probe_cuda()
@@ -200,7 +202,7 @@ def test_a_window_without_a_display_is_caught(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.window
-def test_a_window_of_pygame_s_that_opened_is_told_with_its_display(
+def test_a_window_of_pygame_s_that_opened_is_reported_with_its_display(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pytest.importorskip("pygame")
@@ -220,8 +222,8 @@ def test_a_spacemouse_is_named_and_none_is_no_fault(monkeypatch: pytest.MonkeyPa
     assert "none plugged in" in doctor.probe_spacemouse()
 
 
-def test_wrong_physics_and_an_empty_picture_are_caught() -> None:
+def test_wrong_physics_and_an_empty_image_are_caught() -> None:
     with pytest.raises(ProbeFailed, match=r"is at 1\.000 m"):
         doctor._check_fall(1.0)
     with pytest.raises(ProbeFailed, match="does not show it"):
-        doctor._check_picture(False)
+        doctor._check_image(False)

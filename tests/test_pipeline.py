@@ -154,7 +154,7 @@ def test_a_skill_runs_on_what_it_notes_or_on_what_is_given(there):
     placed = sart.Placement(0.01, 0.0)
     seen = sart.run_skill(
         "skill", placement=placed, robot="ur5e_2f85", task="peg_in_hole",
-        watch=lambda picture, step, success: steps.append(step),
+        watch=lambda image, step, success: steps.append(step),
     )  # fmt: skip
     assert seen.placement == placed and len(steps) == seen.steps + 1
     with pytest.raises(MissingFile, match="no such skill directory"):
@@ -177,7 +177,7 @@ def test_a_whole_run_takes_objects_and_resumes(there, tmp_path, caplog):
     assert {kind: config[kind] for kind in NOTED} == NOTED
     (tmp_path / "run" / "evaluation.json").unlink()
     caplog.clear()
-    # The same, told by reference.
+    # The same, given by reference.
     given |= {"robot": "my_things.py:ROBOT", "backend": "my_things.py:Simulator"}
     sart.run("my_things.py:Drawer", tmp_path / "run", **given)
     assert [record.message.split()[0] for record in caplog.records] == [

@@ -122,7 +122,7 @@ def test_an_applied_motion_is_found_again(T, motion):
 
 @PROPERTY
 @given(poses, poses, motions)
-def test_a_motion_is_told_in_the_moving_frame(T, T_other, motion):
+def test_a_motion_is_reported_in_the_moving_frame(T, T_other, motion):
     moved = T_other @ apply_motion(T, motion)
     np.testing.assert_allclose(apply_motion(T_other @ T, motion), moved, atol=1e-12)
 
@@ -164,9 +164,9 @@ def test_the_line_does_not_bend_as_a_screw_does():
 def test_orthonormalising_removes_rounding_drift_and_nothing_else(rotvec, seed):
     R = exp_rotation(rotvec)
     drifted = R + 1e-7 * np.random.default_rng(seed).uniform(-1, 1, (3, 3))
-    mended = orthonormalised(drifted)
-    np.testing.assert_allclose(mended @ mended.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(mended, R, atol=1e-6)
+    repaired = orthonormalised(drifted)
+    np.testing.assert_allclose(repaired @ repaired.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(repaired, R, atol=1e-6)
     np.testing.assert_allclose(orthonormalised(R), R, atol=1e-15)
 
 

@@ -27,7 +27,7 @@ def test_files_of_one_name_in_two_folders_are_two_modules(tmp_path):
     assert [load_file(tmp_path / n / "robot.py").NAME for n in ("a", "b")] == ["a", "b"]
 
 
-def test_a_file_that_fails_is_tried_again_next_time(tmp_path):
+def test_a_file_that_fails_is_loaded_again_next_time(tmp_path):
     path = tmp_path / "broken.py"
     path.write_text("1 / 0\n")
     with pytest.raises(ZeroDivisionError):

@@ -208,26 +208,26 @@ def _synchronise(device: torch.device) -> None:
 
 
 def _synthetic_dataset(path: Path, n_episodes: int, flat: bool = False) -> Dataset:
-    """A dataset of 128x128 pictures, shaped as augmentation makes them.
+    """A dataset of 128x128 images, shaped as augmentation makes them.
 
-    The pictures are noise, or `flat`: a plain one with a box in it, as easy to compress as any.
+    The images are noise, or `flat`: a plain one with a box in it, as easy to compress as any.
     """
     rng = np.random.default_rng(0)
 
-    def pictures(n: int) -> NDArray[np.uint8]:
+    def images(n: int) -> NDArray[np.uint8]:
         if not flat:
             return rng.integers(0, 256, (n, 128, 128, 3), dtype=np.uint8)
         plain = np.empty((n, 128, 128, 3), np.uint8)
         plain[:] = rng.integers(0, 256, (n, 1, 1, 3), dtype=np.uint8)
-        for picture, (u, v) in zip(plain, rng.integers(0, 96, (n, 2)), strict=True):
-            picture[u : u + 32, v : v + 32] = 255 - picture[0, 0]
+        for image, (u, v) in zip(plain, rng.integers(0, 96, (n, 2)), strict=True):
+            image[u : u + 32, v : v + 32] = 255 - image[0, 0]
         return plain
 
     def steps(n: int) -> Steps:
         commanded = np.tile(pose((0.4, 0.0, 0.3)), (n, 1, 1))
         commanded[:, :3, 3] += np.cumsum(rng.normal(0, 0.005, (n, 3)), 0)
         camera = CameraRecord(
-            rgb=pictures(n),
+            rgb=images(n),
             depth=np.zeros((n, 128, 128), np.float32),
             intrinsics=np.diag([128.0, 128.0, 1.0]),
             frame="tool",
@@ -288,7 +288,7 @@ def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
     imports included, is what is reported: all of it, and the part that no file backs. Only then the
     images are copied into memory, and steps on batches from the file and from the copy alternate,
     so that whatever else the machine does slows both; the ratios, of time that passed and of the
-    processor's time, are medians over blocks of steps. `file_from_disk`: after the kernel was told
+    processor's time, are medians over blocks of steps. `file_from_disk`: after the kernel was asked
     to drop what it keeps of the file.
     """
     parser = argparse.ArgumentParser(
@@ -449,7 +449,7 @@ print(json.dumps(result))
 def bench_dataset(arguments: Sequence[str]) -> dict[str, Any]:
     """Seconds and peak memory of opening a large dataset and of generating a small and a large one.
 
-    The large dataset is synthetic: 20 steps an episode, 128x128 RGB-D, pictures that are easy to
+    The large dataset is synthetic: 20 steps an episode, 128x128 RGB-D, images that are easy to
     compress. Each figure is of a program of its own. Opening is `load_dataset` after its imports;
     `info` is the whole command, from its imports on.
     """
@@ -503,7 +503,7 @@ def _measured(work: str, *arguments: Any) -> dict[str, Any]:
 def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
     """Kept trajectories per second and simulated over wall time, one process, RGB and depth kept.
 
-    A whole call of the engine each time: loading the simulator, every try, writing the episodes.
+    A whole call of the engine each time: the simulator, every attempt, writing the episodes.
     """
     parser = argparse.ArgumentParser(prog="bench.py augment", description=bench_augment.__doc__)
     parser.add_argument("--task", default="peg_in_hole", help=", ".join(TASKS))
@@ -571,7 +571,7 @@ class _Setting(NamedTuple):
 def bench_certificate(arguments: Sequence[str]) -> dict[str, Any]:
     """Time and soundness of certificates on random straight segments, by scene.
 
-    Every registered task's scene, its object placed anew for every 50 segments, and four kinds of
+    Every registered task's scene, its object placed again for every 50 segments, and four kinds of
     generated ones, another every 50 segments; half of the segments pass near something. Each
     verdict is held against PyBullet's closest points at many configurations of the same path: a
     certified segment that collides there is unsound; one that isn't certified although it clears
@@ -617,7 +617,7 @@ def bench_certificate(arguments: Sequence[str]) -> dict[str, Any]:
 
 def _setting(kind: str, rng: np.random.Generator) -> _Setting:
     """A task's scene at a random placement, or a generated one."""
-    carried: dict[str, Array] = {}
+    grasped: dict[str, Array] = {}
     if kind in TASKS:
         task = get_task(kind)
         robot = get_robot(task.robot)
@@ -629,7 +629,7 @@ def _setting(kind: str, rng: np.random.Generator) -> _Setting:
         fingers = robot.gripper.finger_links
         touching = [probe.names(k) for k, d in enumerate(probe.distances(home)) if d < 1e-3]
         T_tool_world = inverse(model.fk(home))
-        carried = {name: T_tool_world @ Ts[name] for name in scene.grasped(touching, fingers)}
+        grasped = {name: T_tool_world @ Ts[name] for name in scene.grasped(touching, fingers)}
     else:
         robot = get_robot("ur5e_2f85")
         scene = CLUTTER[kind](rng)
@@ -639,11 +639,11 @@ def _setting(kind: str, rng: np.random.Generator) -> _Setting:
     standing = tuple(
         dataclasses.replace(body, T_world_body=Ts[body.name])
         for body in scene.bodies
-        if body.name not in carried
+        if body.name not in grasped
     )
     closest = ClosestPoints(robot, scene, joints_apart=2)
-    closest.place(Ts, gripper, carried)
-    placed = CollisionModel(robot, scene).placed(Ts, gripper, carried)
+    closest.place(Ts, gripper, grasped)
+    placed = CollisionModel(robot, scene).placed(Ts, gripper, grasped)
     return _Setting(kind, placed, closest, model, SceneSpec(standing), home)
 
 
@@ -746,10 +746,10 @@ def _certificate_figures(rows: Sequence[dict[str, Any]], margin: float) -> dict[
 
 
 def bench_step(arguments: Sequence[str]) -> dict[str, Any]:
-    """Control steps/s with an RGB-D picture at each, by task and backend, and the parts' costs.
+    """Control steps/s with an RGB-D image at each, by task and backend, and the parts' costs.
 
     The scripted operator carries out its demonstration; only what the backend does is counted:
-    measuring, drawing the wrist camera's picture, and 1/30 s of physics. One thread.
+    measuring, drawing the wrist camera's image, and 1/30 s of physics. One thread.
     """
     parser = argparse.ArgumentParser(prog="bench.py step", description=bench_step.__doc__)
     parser.add_argument("--tasks", default="all", help=f"all, or {','.join(TASKS)}")
@@ -771,7 +771,7 @@ def bench_step(arguments: Sequence[str]) -> dict[str, Any]:
             medians = np.median(turns, axis=0)
             figures[f"{name}/{kind}"] = {
                 "control_steps_per_second": 1 / medians.sum(),
-                "picture_ms": medians[0] * 1e3,
+                "image_ms": medians[0] * 1e3,
                 "physics_ms": medians[1] * 1e3,
             }
             _say(f"{name}/{kind}: {1 / medians.sum():.0f} control steps/s")
@@ -787,21 +787,21 @@ def bench_step(arguments: Sequence[str]) -> dict[str, Any]:
 
 
 def _drive(backend: Backend, task: Task, seed: int) -> tuple[float, float]:
-    """Mean seconds of a picture and of a control period's physics in one demonstration."""
+    """Mean seconds of an image and of a control period's physics in one demonstration."""
     model = RobotModel(backend.robot, task.scene.held)
     state = task.initial_state(model, Placement())
     operator = ScriptedOperator(task.plan(state), np.random.default_rng(seed))
     controller = ToolController(model)
     require(backend, Resets, "each demonstration begins at the task's start").reset(state)
     controller.reset(state.q)
-    picture, physics = [], []
+    image, physics = [], []
     while True:
         started = time.perf_counter()
         seen = backend.observe(("wrist",))
-        picture.append(time.perf_counter() - started)
+        image.append(time.perf_counter() - started)
         command = operator.read(seen)
         if command.stop:
-            return statistics.mean(picture), statistics.mean(physics)
+            return statistics.mean(image), statistics.mean(physics)
         desired = apply_motion(
             controller.commanded_T_world_tool, command.velocity / backend.rates.control_hz
         )
@@ -827,7 +827,7 @@ _X_NAMES = {"Enter": "Return", "Backspace": "BackSpace", "+": "equal", "-": "min
 def bench_annotate(arguments: Sequence[str]) -> dict[str, Any]:
     """Milliseconds from a key to what it changes, in the annotator's window and session.
 
-    `picture`: from xdotool's start to the first picture of the screen that differs, at 1280 x 800
+    `image`: from xdotool's start to the first image of the screen that differs, at 1280 x 800
     on a screen of its own; each key once all has come to rest. `session`: what a key does, with
     all that the window asks the session afterwards; `cold` with nothing computed ahead.
     """
@@ -860,9 +860,9 @@ def bench_annotate(arguments: Sequence[str]) -> dict[str, Any]:
         pass
     with tempfile.TemporaryDirectory() as scratch:
         save_demonstration(Path(scratch) / "demo.h5", demonstration)
-        pictures = _picture_ms(Path(scratch), options.points, keys, WindowConfig())
+        images = _image_ms(Path(scratch), options.points, keys, WindowConfig())
     return {
-        "picture_ms": _spread(pictures),
+        "image_ms": _spread(images),
         "session_ms": _spread(_session_ms(session, keys)),
         "session_cold_ms": _spread(cold),
         "points": options.points,
@@ -893,10 +893,8 @@ def _session_ms(session: AnnotationSession, keys: Sequence[str]) -> list[float]:
     return figures
 
 
-def _picture_ms(
-    folder: Path, points: int, keys: Sequence[str], config: WindowConfig
-) -> list[float]:
-    """For each key the time until the screen shows another picture."""
+def _image_ms(folder: Path, points: int, keys: Sequence[str], config: WindowConfig) -> list[float]:
+    """For each key the time until the screen shows another image."""
     figures = []
     with Desktop(config.width, config.height) as screen:
         program = [sys.executable, __file__, "annotate", "--window", str(folder)]
@@ -918,17 +916,17 @@ def _picture_ms(
 
 def _at_rest(screen: Desktop, seconds: float) -> bytes:
     """The screen once nothing has changed on it for so long."""
-    picture, since = screen.screenshot().tobytes(), time.perf_counter()
+    image, since = screen.screenshot().tobytes(), time.perf_counter()
     while time.perf_counter() - since < seconds:
         time.sleep(0.1)
         now = screen.screenshot().tobytes()
-        if now != picture:
-            picture, since = now, time.perf_counter()
-    return picture
+        if now != image:
+            image, since = now, time.perf_counter()
+    return image
 
 
 def _show_window(folder: Path, points: int) -> None:
-    """The annotator with so many points: those of the pictures, several times with some noise."""
+    """The annotator with so many points: those of the images, several times with some noise."""
     from sart_toolkit.annotate.open3d_window import annotate_in_window
 
     demonstration = load_demonstration(folder / "demo.h5")

@@ -1,11 +1,11 @@
-"""What a person does, done by machine hands in the real windows: `python tools/human_path.py DIR`.
+"""A person's way through the real windows, by scripted input: `python tools/human_path.py DIR`.
 
 A demonstration is recorded with the keyboard and annotated, then augmented and trained on, and the
-skill is tried. A screen that nobody looks at shows the windows, keys are pressed on it as fingers
-would, and pictures are taken. The hands know no more than eyes would tell them: where the tool is
+skill is evaluated. A virtual screen shows the windows, keys are pressed on it as fingers
+would, and images are taken. The hands know no more than eyes would show them: where the tool is
 and what the windows say, read from `--status` and from the annotator's journal; and where the
 object stands. Each stage is a function and a line in `STAGES`; they leave what a person's work
-would leave in DIR, and `human_path.json` tells what came of each.
+would leave in DIR, and `human_path.json` holds the result of each.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from sart_toolkit.testing.desktop import Desktop
 _SART = (sys.executable, "-c", "from sart_toolkit.cli import main; main()")
 # Slow within this [m] of where the hand is heading, and how long [s] it takes to react.
 _NEAR, _REACTION = 0.06, 0.2
-# Between the legs of the way a person looks where they are.
+# Between plan steps a person checks where the tool is.
 _LOOK = 0.6
 # Keys of the annotator by their X names. By hand: a sphere at the start made larger in coarse
 # steps, then one at each convergence waypoint as far as there is room, save, leave.
@@ -56,18 +56,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("directory", type=Path, help="where the results go")
     parser.add_argument("--task", default="peg_in_hole", help="what is done")
-    parser.add_argument("--pictures", type=Path, help="folder for pictures of the windows")
+    parser.add_argument("--images", type=Path, help="folder for images of the windows")
     parser.add_argument("--stages", nargs="*", default=list(STAGES), help=f"of {', '.join(STAGES)}")
     parser.add_argument("--episodes", type=int, default=50, help="rollouts of the skill")
     options = parser.parse_args(arguments)
-    pictures = options.pictures or options.directory / "pictures"
+    images = options.images or options.directory / "images"
     report_file = options.directory / "human_path.json"
     try:
         for stage in options.stages:
             if stage not in STAGES:
                 raise unknown_name("stage", stage, STAGES)
         get_task(options.task)
-        for folder in (options.directory, pictures):
+        for folder in (options.directory, images):
             folder.mkdir(parents=True, exist_ok=True)
         report: dict[str, Any] = read_json(report_file) if report_file.exists() else {"stages": {}}
         report |= {
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         }
         for stage in options.stages:
             started = time.monotonic()
-            said = STAGES[stage](options, pictures)
+            said = STAGES[stage](options, images)
             seconds = round(time.monotonic() - started, 1)
             report["stages"][stage] = said | {"wall_seconds": seconds}
             write_json(report_file, report)
@@ -92,8 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 # --- recording ----------------------------------------------------------------------------------
 
 
-def record(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
-    """What came of recording `demo.h5` with the keyboard; pictures of each state are taken."""
+def record(options: argparse.Namespace, images: Path) -> dict[str, Any]:
+    """The result of recording `demo.h5` with the keyboard; images of each state are taken."""
     name, directory = options.task, options.directory
     task = get_task(name)
     model = RobotModel(get_robot(task.robot), task.scene.held)
@@ -101,31 +101,31 @@ def record(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
     with Desktop() as desktop:
         program = desktop.start(
             [*_SART, "record", name, "--out", str(out), "--device", "keyboard", "--overwrite",
-             "--operator", "machine hands", "--status", str(status)]
+             "--operator", "scripted input", "--status", str(status)]
         )  # fmt: skip
         desktop.window(f"sart record {name}")
         hands = _Hands(desktop, program, status, views(model, task.scene).R_world_hand)
         hands.see("state", "ready")
         time.sleep(_LOOK)
-        desktop.screenshot(pictures / "record_ready.png")
+        desktop.screenshot(images / "record_ready.png")
         desktop.key("Right")
-        for leg in task.plan(task.initial_state(model, Placement())):
-            hands.steer(leg)
+        for step in task.plan(task.initial_state(model, Placement())):
+            hands.steer(step)
             if hands.look()["state"] == "recording":
-                desktop.screenshot(pictures / "record_recording.png")
+                desktop.screenshot(images / "record_recording.png")
         hands.see("state", "ended")
-        desktop.screenshot(pictures / "record_ended.png")
+        desktop.screenshot(images / "record_ended.png")
         desktop.key("Right")
         hands.see("state", "saved")
-        desktop.screenshot(pictures / "record_saved.png")
+        desktop.screenshot(images / "record_saved.png")
         said, errors = program.communicate(timeout=60)
         if program.returncode != 0:
             raise TimeoutError(f"sart record ended with code {program.returncode}: {errors}{said}")
-    shown = load_demonstration(out)
+    demonstration = load_demonstration(out)
     return {
-        "recorded_seconds": round(float(shown.timestamps[-1]), 1),
-        "seconds_of_a_person": round(shown.seconds, 1),
-        "reached_the_goal": bool(shown.success[-1]),
+        "recorded_seconds": round(float(demonstration.timestamps[-1]), 1),
+        "seconds_of_a_person": round(demonstration.seconds, 1),
+        "reached_the_goal": bool(demonstration.success[-1]),
     }
 
 
@@ -162,29 +162,29 @@ class _Hands:
             time.sleep(0.05)
         return now
 
-    def steer(self, leg: PlanStep, timeout_s: float = 60.0) -> None:
-        """Bring the tool to the end of a leg, or until the recording ends by itself."""
+    def steer(self, step: PlanStep, timeout_s: float = 60.0) -> None:
+        """Bring the tool to the end of a plan step, or until the recording ends by itself."""
         deadline = time.monotonic() + timeout_s
         while (now := self.look())["state"] != "ended":
             if time.monotonic() > deadline:
                 raise TimeoutError(f"the tool did not get there: {now['notice']}")
             if now["state"] == "recording":
-                self._close_or_open(now["gripper"], leg.gripper)
-                speed, wanted = self._keys(np.array(now["T_world_tool"]), leg)
+                self._close_or_open(now["gripper"], step.gripper)
+                speed, wanted = self._keys(np.array(now["T_world_tool"]), step)
                 self._choose_speed(speed)
                 self._hold(wanted)
                 if not wanted:
                     break
             time.sleep(0.03)
         self._hold(set())
-        time.sleep(_LOOK + leg.pause)
+        time.sleep(_LOOK + step.pause)
 
-    def _keys(self, T_world_tool: Array, leg: PlanStep) -> tuple[str, set[str]]:
-        """The speed to choose and the keys to hold, so as to come nearer to the end of a leg."""
-        motion = relative_motion(T_world_tool, leg.T_world_tool)
+    def _keys(self, T_world_tool: Array, step: PlanStep) -> tuple[str, set[str]]:
+        """The speed to choose and the keys to hold, to come nearer to the end of a plan step."""
+        motion = relative_motion(T_world_tool, step.T_world_tool)
         R_hand_tool = self._R_world_hand.T @ T_world_tool[:3, :3]
         left = np.concatenate([R_hand_tool @ motion[:3], R_hand_tool @ motion[3:]])
-        careful = leg.speed < 0.04 or float(np.abs(left[:3]).max()) < _NEAR
+        careful = step.speed < 0.04 or float(np.abs(left[:3]).max()) < _NEAR
         speed = SPEEDS[0] if careful else SPEEDS[1]
         # Let go a reaction's way before the end.
         reach = _REACTION * np.repeat([speed.linear, np.deg2rad(speed.turn_deg)], 3)
@@ -201,8 +201,8 @@ class _Hands:
             self._desktop.key(key)
             self._speed = key
 
-    def _close_or_open(self, told: float, wanted: float) -> None:
-        if (told > 0.5) != (wanted > 0.5) and wanted != self._gripper:
+    def _close_or_open(self, commanded: float, wanted: float) -> None:
+        if (commanded > 0.5) != (wanted > 0.5) and wanted != self._gripper:
             self._desktop.key("space")
             self._gripper = wanted
 
@@ -210,23 +210,23 @@ class _Hands:
 # --- annotating ---------------------------------------------------------------------------------
 
 
-def annotate(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
-    """What came of annotating by hand: `annotation.json`."""
-    return _annotated(options, "annotation", BY_HAND, pictures)
+def annotate(options: argparse.Namespace, images: Path) -> dict[str, Any]:
+    """The result of annotating by hand: `annotation.json`."""
+    return _annotated(options, "annotation", BY_HAND, images)
 
 
-def suggest(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
-    """What came of taking all suggestions instead: `suggested.json`."""
-    return _annotated(options, "suggested", SUGGESTED, pictures)
+def suggest(options: argparse.Namespace, images: Path) -> dict[str, Any]:
+    """The result of taking all suggestions instead: `suggested.json`."""
+    return _annotated(options, "suggested", SUGGESTED, images)
 
 
 def _annotated(
-    options: argparse.Namespace, name: str, keys: Sequence[str], pictures: Path
+    options: argparse.Namespace, name: str, keys: Sequence[str], images: Path
 ) -> dict[str, Any]:
-    """What came of pressing keys in the annotator's window, the last of which save and leave.
+    """The result of pressing keys in the annotator's window, the last of which save and leave.
 
     The next key is pressed once the one before has been done, which the journal tells; `seconds`
-    are those from the first key to the window's end, without those for a picture of it.
+    are those from the first key to the window's end, without those for an image of it.
     """
     demo, out = options.directory / "demo.h5", options.directory / f"{name}.json"
     journal = out.with_name(f"{out.name}.journal")
@@ -245,7 +245,7 @@ def _annotated(
         seconds = time.monotonic() - started
         # With the whole cloud and the sampled poses, which wait until nothing is pressed.
         time.sleep(3.0)
-        desktop.screenshot(pictures / f"annotate_{name}.png")
+        desktop.screenshot(images / f"annotate_{name}.png")
         started_leaving = time.monotonic()
         desktop.key(keys[-1])
         said, errors = program.communicate(timeout=60)
@@ -270,23 +270,23 @@ def _annotated(
 # --- learning -----------------------------------------------------------------------------------
 
 
-def augment(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
-    """What came of augmenting with the annotation by hand: `dataset/`."""
+def augment(options: argparse.Namespace, images: Path) -> dict[str, Any]:
+    """The result of augmenting with the annotation by hand: `dataset/`."""
     folder = options.directory
     made = _sart("augment", folder / "demo.h5", folder / "annotation.json",
                  "--out", folder / "dataset", "--workers", 2, "--overwrite")  # fmt: skip
     return {name: made[name] for name in ("n_trajectories", "n_kept", "n_attempted")}
 
 
-def train(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
-    """What came of training on the dataset: `skill/`."""
+def train(options: argparse.Namespace, images: Path) -> dict[str, Any]:
+    """The result of training on the dataset: `skill/`."""
     folder = options.directory
     made = _sart("train", folder / "dataset", "--out", folder / "skill", "--overwrite")
     return {"policy": made["policy"], "seconds": made["seconds"]}
 
 
-def evaluate(options: argparse.Namespace, pictures: Path) -> dict[str, Any]:
-    """What came of trying the skill: `evaluation.json`."""
+def evaluate(options: argparse.Namespace, images: Path) -> dict[str, Any]:
+    """The result of trying the skill: `evaluation.json`."""
     folder = options.directory
     made = _sart("evaluate", folder / "skill", "--out", folder / "evaluation.json",
                  "--episodes", options.episodes, "--workers", 2, "--overwrite")  # fmt: skip

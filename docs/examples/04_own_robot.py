@@ -1,4 +1,4 @@
-"""A robot of one's own: a KUKA iiwa with seven joints, a Robotiq 2F-85 and a wrist camera.
+"""A robot of your own: a KUKA iiwa with seven joints, a Robotiq 2F-85 and a wrist camera.
 
 In Python: python docs/examples/04_own_robot.py OUT_DIR [N_TRAJECTORIES EPOCHS ROLLOUTS]
 By verbs:  sart run peg_in_hole --robot docs/examples/04_own_robot.py:IIWA --out OUT_DIR

@@ -1,4 +1,4 @@
-"""A task of one's own: push an open drawer shut with closed fingers.
+"""A task of your own: push an open drawer shut with closed fingers.
 
 In Python: python docs/examples/05_own_task.py OUT_DIR [N_TRAJECTORIES EPOCHS ROLLOUTS]
 By verbs:  sart run docs/examples/05_own_task.py:Drawer --out OUT_DIR

@@ -1,4 +1,4 @@
-"""A strategy of one's own: poses anywhere inside a sphere instead of on its surface.
+"""A strategy of your own: poses anywhere inside a sphere instead of on its surface.
 
 In Python: python docs/examples/06_own_strategy.py OUT_DIR [N_TRAJECTORIES EPOCHS ROLLOUTS]
 By verbs:  sart augment demo.h5 annotation.json --out dataset

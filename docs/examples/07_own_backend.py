@@ -1,4 +1,4 @@
-"""A backend of one's own: an arm that is wherever it was commanded to be, drawn by PyBullet.
+"""A backend of your own: an arm that is wherever it was commanded to be, drawn by PyBullet.
 
 In Python: python docs/examples/07_own_backend.py OUT_DIR [N_TRAJECTORIES EPOCHS ROLLOUTS]
 By verbs:  sart run peg_in_hole --backend docs/examples/07_own_backend.py:Kinematic --out OUT_DIR

@@ -100,7 +100,7 @@ def annotate_in_window(
         session: what is shown and done.
         robot: the robot that was steered.
         scene: what is fixed to it, and the bodies to draw where the demonstration has them.
-        cloud: points to draw; fused from the demonstration's pictures if left out.
+        cloud: points to draw; fused from the demonstration's images if left out.
         config: how it is drawn.
     """
     if cloud is None and any(c.depth.any() for c in session.demonstration.steps.cameras.values()):
@@ -166,7 +166,7 @@ class AnnotationWindow:
         self._moving = False
         self._last_key = self._last_close = 0.0
         self._resets = session.view_resets
-        self._looks: dict[int, tuple[Word, bool]] = {}
+        self._drawn: dict[int, tuple[Word, bool]] = {}
         self._ghost_gripper: float | None = None
         self._labels: list[Any] = []
         self._panel = _Panel(self._window, session, mono, small)
@@ -284,23 +284,23 @@ class AnnotationWindow:
 
     def _draw_spheres(self) -> None:
         session, scene = self._session, self._view.scene
-        for i in range(max(len(session.spheres), len(self._looks))):
+        for i in range(max(len(session.spheres), len(self._drawn))):
             ball, rings = f"sphere {i}", f"rings {i}"
             if i >= len(session.spheres):
                 scene.show_geometry(ball, False)
                 scene.show_geometry(rings, False)
                 continue
             sphere = session.spheres[i]
-            # Glass is dear on a CPU: only the sphere at hand is made of it.
-            look = session.verdict(sphere).word, sphere is session.governing
-            if self._looks.get(i) != look:
-                colour, glass = _COLOURS[look[0]], look[1]
+            # Transparency is expensive on a CPU: only the current sphere has it.
+            style = session.verdict(sphere).word, sphere is session.governing
+            if self._drawn.get(i) != style:
+                colour, glass = _COLOURS[style[0]], style[1]
                 for name in (ball, rings):
                     scene.remove_geometry(name)
                 if glass:
-                    scene.add_geometry(ball, _ball(1.0, colour), _glass(0.45))
+                    scene.add_geometry(ball, _ball(1.0, colour), _transparent(0.45))
                 scene.add_geometry(rings, _rings(colour), _line_material(2.5 if glass else 1.5))
-                self._looks[i] = look
+                self._drawn[i] = style
             T = np.diag([*[sphere.radius] * 3, 1.0])
             T[:3, 3] = sphere.T_world_key[:3, 3]
             for name in (ball, rings):
@@ -308,7 +308,7 @@ class AnnotationWindow:
                 scene.set_geometry_transform(name, T)
 
     def _draw_governing(self) -> None:
-        """Convergence waypoint and sampled poses of the sphere at hand, and the labels."""
+        """Convergence waypoint and sampled poses of the current sphere, and the labels."""
         session, scene = self._session, self._view.scene
         for label in self._labels:
             self._view.remove_3d_label(label)
@@ -351,7 +351,7 @@ class AnnotationWindow:
             tool = _textured(tool)
             for i in range(self._session.config.ghosts):
                 scene.remove_geometry(f"ghost {i}")
-                scene.add_geometry(f"ghost {i}", tool, _glass(0.25))
+                scene.add_geometry(f"ghost {i}", tool, _transparent(0.25))
             self._ghost_gripper = gripper
         for i, T in enumerate(self._session.ghosts(sphere)):
             scene.show_geometry(f"ghost {i}", True)
@@ -374,21 +374,21 @@ class AnnotationWindow:
 
 
 class _Panel:
-    """Wrist picture, words about the waypoint, spheres, messages and keys."""
+    """Wrist image, words about the waypoint, spheres, messages and keys."""
 
     def __init__(self, window: Any, session: AnnotationSession, mono: int, small: int) -> None:
         self._session, self._window = session, window
         self._em = em = window.theme.font_size
         camera = next(iter(session.demonstration.steps.cameras.values()), None)
-        self._pictures = None if camera is None else camera.rgb
+        self._images = None if camera is None else camera.rgb
         self._size = round(14 * em)
         self._side = gui.Vert(0.3 * em, gui.Margins(0.8 * em))
         self._side.background_color = gui.Color(*_PAPER)
-        self._picture = gui.ImageWidget(_picture(np.full((1, 1, 3), 230, np.uint8), self._size))
+        self._image = gui.ImageWidget(_image(np.full((1, 1, 3), 230, np.uint8), self._size))
         self._side.add_fixed(0.8 * em)
         row = gui.Horiz()
         row.add_stretch()
-        row.add_child(self._picture)
+        row.add_child(self._image)
         row.add_stretch()
         self._side.add_child(row)
         row = gui.Horiz(em)
@@ -426,8 +426,8 @@ class _Panel:
     def update(self) -> None:
         """Say what the session says."""
         session = self._session
-        if self._pictures is not None:
-            self._picture.update_image(_picture(self._pictures[session.selected], self._size))
+        if self._images is not None:
+            self._image.update_image(_image(self._images[session.selected], self._size))
         self._state.text = "\n".join(
             textwrap.shorten(line, 30, placeholder=" ...") for line in self._state_lines().values()
         )
@@ -486,14 +486,14 @@ def _label(parent: Any, text: str, colour: Sequence[float], font: int | None = N
     return label
 
 
-def _picture(rgb: Image, size: int) -> Any:
-    """A picture of so many pixels a side."""
+def _image(rgb: Image, size: int) -> Any:
+    """An image of so many pixels a side."""
     scaled = PillowImage.fromarray(rgb).resize((size, size), PillowImage.Resampling.BICUBIC)
     pixels: Any = np.array(scaled)
     return open3d.geometry.Image(pixels)
 
 
-def _glass(alpha: float) -> Any:
+def _transparent(alpha: float) -> Any:
     """For meshes with colours of their own."""
     material = rendering.MaterialRecord()
     material.shader = "defaultLitTransparency"
@@ -521,7 +521,7 @@ def _plain(point_size: float = 1.0) -> Any:
 def _shaded(mesh: DrawnMesh, T_world_mesh: Array) -> Any:
     """A mesh of flat triangles, its light drawn on once, where it stands at `T_world_mesh`.
 
-    A light that is computed for every picture takes a CPU twice as long as all the rest.
+    A light that is computed for every image takes a CPU twice as long as all the rest.
     """
     corners = mesh.vertices[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

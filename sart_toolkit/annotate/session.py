@@ -102,7 +102,7 @@ class AnnotationSession:
         demonstration: what is annotated.
         config: what the keys do.
         out: the file that is saved to.
-        selected: the waypoint that is looked at.
+        selected: the waypoint on display.
         spheres: in order of their waypoints.
         message: what the last action did, or why it couldn't.
         refused: whether the last action couldn't be done.
@@ -126,10 +126,10 @@ class AnnotationSession:
         """Begin with an annotation's spheres or with none, and with what a journal has kept.
 
         Args:
-            demonstration: what was shown.
+            demonstration: the recorded demonstration.
             world: where the obstacles are.
             config: what the keys do.
-            annotation: to go on with.
+            annotation: the one to continue.
             out: file to save to.
             journal: where each action is kept at once; what an interrupted session left in it is
                 done again.
@@ -233,7 +233,7 @@ class AnnotationSession:
     @functools.cached_property
     def clearances(self) -> Array:
         """How far `(T,)` [m] the tool was from the nearest obstacle at each waypoint."""
-        # Told of the nearest pair where a radius as small as this fits.
+        # The nearest pair is named where a radius as small as this fits.
         config = SuggestConfig(margin=1e-6, min_radius=1e-6, max_radius=1e-6)
         found = [proved_radius(self._world, t, config).clearance for t in range(self.last + 1)]
         return np.array([np.inf if x is None else x for x in found])
@@ -308,7 +308,7 @@ class AnnotationSession:
         return name is not None
 
     def perform(self, name: str, value: float | None = None) -> None:
-        """Do one action; `message` tells what came of it.
+        """Do one action; `message` says what it did.
 
         Args:
             name: the action's, as in `ACTIONS`.
@@ -584,7 +584,7 @@ class AnnotationSession:
         self._undo, self._redo = [], []
 
     def _replay(self, row: dict[str, Any]) -> None:
-        """Do again what one row of a journal tells."""
+        """Do again what one row of a journal records."""
         if "base" in row:
             self._rebase(row["base"])
         if row["action"] == "undo" and self._undo:
@@ -631,7 +631,7 @@ class Action:
 _Session = AnnotationSession
 ACTIONS: Mapping[str, Action] = {
     "next": Action(("Right",), "next waypoint", lambda s: s._step(1)),
-    "back": Action(("Left",), "waypoint before", lambda s: s._step(-1)),
+    "back": Action(("Left",), "previous waypoint", lambda s: s._step(-1)),
     "ahead": Action(("Page Down",), f"{_JUMP} waypoints on", lambda s: s._step(_JUMP)),
     "behind": Action(("Page Up",), f"{_JUMP} waypoints back", lambda s: s._step(-_JUMP)),
     "start": Action(("Home",), "first waypoint", lambda s: s._select(0)),

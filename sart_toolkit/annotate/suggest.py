@@ -1,4 +1,4 @@
-"""Radii from the scene's geometry instead of from a person's eye."""
+"""Radii from the scene's geometry instead of a person's judgement."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class SuggestConfig:
 
     `margin` [m] stays free everywhere; no radius is below `min_radius` or above `max_radius` [m];
     `rotation_per_metre` [rad/m] is the augmentation's nu_r; `probes` is the number of poses at
-    which the whole robot is tried in a wide sphere.
+    which the whole robot is checked in a wide sphere.
     """
 
     margin: float = 0.0005
@@ -219,12 +219,12 @@ def suggest_radius(
     """The largest radius around waypoint `t` that keeps the robot clear.
 
     Tool bodies are proved clear of the scene for every pose that can be drawn. The whole robot, its
-    reach, and the waypoint that a segment of this radius starts from are tried, the robot at
+    reach, and the waypoint that a segment of this radius starts from are checked, the robot at
     `probes` extreme poses, and the radius shrunk until all pass.
 
     Args:
         world: where the obstacles are.
-        demonstration: what was shown.
+        demonstration: the recorded demonstration.
         t: the key waypoint.
         config: margins and limits.
 
@@ -376,7 +376,7 @@ def _directed(
 ) -> str | None:
     """The names of a pair that a draw aimed at it brings too close; None if there is none.
 
-    Tried are the draw that brings a pair nearest by its distance's gradient at the waypoint, and,
+    Checked are the draw that brings a pair nearest by its distance's gradient at the waypoint, and,
     where that came half the way, the one that does so by the gradient found there.
     """
     angle = config.rotation_per_metre * radius
@@ -459,7 +459,7 @@ def suggest_annotation(
     grasp, release or contact; an object in the grasp counts as part of the tool.
 
     Args:
-        demonstration: what was shown.
+        demonstration: the recorded demonstration.
         world: where the obstacles were.
         waypoints: key waypoints, or `None` to choose them.
         config: margins and limits.

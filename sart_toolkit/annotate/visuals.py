@@ -65,8 +65,8 @@ class DrawnRobot:
         items = self._drawn.geometryObjects
         self.meshes = tuple(_mesh(item) for item in items)
         wrist = self._model.getJointId(model.spec.arm_joints[-1])
-        carried = [wrist in list(support) for support in self._model.supports]
-        self.tool = tuple(i for i, item in enumerate(items) if carried[item.parentJoint])
+        moved = [wrist in list(support) for support in self._model.supports]
+        self.tool = tuple(i for i, item in enumerate(items) if moved[item.parentJoint])
 
     def poses(self, q: Array, gripper: float) -> Array:
         """Where the parts are: poses `(n, 4, 4)` in the world.

@@ -25,13 +25,13 @@ ALLOCATIONS = ("radius", "equal")
 class AugmentConfig:
     """What to generate.
 
-    `n`: trajectories in all, the demonstrations among them; how the spheres share the others tells
-    `quotas`, their weights being their radii, or with `allocation` "equal" all the same, as in the
-    paper. `duration` [s] is the paper's delta, the least that a segment takes. Every segment is
-    proved to keep `margin` [m] free of the `obstacles`, the bodies of the scene or the cloud that
-    the demonstration's cameras saw, even if what is grasped slips by `slip_tolerance` [m]; if any
-    point of it moves farther in the grasp the segment is rejected. `cameras`: whose pictures are
-    recorded, `None` for those of the demonstration. `executor`: how segments are carried out.
+    `n`: trajectories in all, the demonstrations among them; `quotas` allocates the others to the
+    spheres, weighted by radius, or with `allocation` "equal" all the same, as in the paper.
+    `duration` [s] is the paper's delta, the least that a segment takes. Every segment is proved to
+    keep `margin` [m] free of the `obstacles`, the bodies of the scene or the cloud that the
+    demonstration's cameras saw, even if what is grasped slips by `slip_tolerance` [m]; if any point
+    of it moves farther in the grasp the segment is rejected. `cameras`: whose images are recorded,
+    `None` for those of the demonstration. `executor`: how segments are executed.
     `strategy` may be given as an object; its reference is kept.
     """
 

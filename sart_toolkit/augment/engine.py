@@ -45,11 +45,11 @@ class _Worker:
     ) -> None:
         self._files = files
         self._backend = make_backend()
-        shown = [(source.demonstration, source.annotation) for source in sources]
-        self._executor = get_executor(config.executor)(self._backend, shown, config)
+        pairs = [(source.demonstration, source.annotation) for source in sources]
+        self._executor = get_executor(config.executor)(self._backend, pairs, config)
 
     def results(self, keys: Iterable[AttemptKey]) -> Iterator[_Result]:
-        """What comes of attempts, one after the other, in the executor's order."""
+        """The results of attempts, one after the other, in the executor's order."""
         for attempt in self._executor.attempts(keys):
             episode = attempt.episode
             entry = None if episode is None else self._files.write(episode)
@@ -89,7 +89,7 @@ def augment_sources(
 ) -> Dataset:
     """Generate a dataset directory from demonstrations of one task and their annotations.
 
-    The spheres of all demonstrations share the trajectories that are wanted. Neither the number of
+    The trajectories are allocated to the spheres of all demonstrations. Neither the number of
     workers nor an interruption changes what is generated: called again with the same arguments it
     resumes.
 
@@ -105,7 +105,7 @@ def augment_sources(
     Raises:
         Mismatch: an annotation belongs to another demonstration, the demonstrations to different
             tasks or robots, one holds no saved states, or the backend has other rates.
-        MissingCapability: the backend can't do what the executor needs, or take the pictures.
+        MissingCapability: the backend can't do what the executor needs, or take the images.
         UnknownName: no such executor or camera.
         OutputExists: `out` holds something else and `overwrite` is false.
         CannotWrite: the disk refuses, or another process is at work on `out`.
@@ -179,7 +179,11 @@ def _results(
 
 
 def _finish(
-    writer: DatasetWriter, shown: Demonstration, config: AugmentConfig, wanted: int, seconds: float
+    writer: DatasetWriter,
+    demonstration: Demonstration,
+    config: AugmentConfig,
+    wanted: int,
+    seconds: float,
 ) -> Dataset:
     attempted = writer.n_kept + writer.n_rejected
     reasons = ", ".join(f"{reason}: {count}" for reason, count in writer.rejections.items())
@@ -193,11 +197,11 @@ def _finish(
         _log.warning("only %d of %d trajectories were kept (%s)", writer.n_kept, wanted, reasons)
     return writer.finish(
         {
-            "task": shown.task,
-            "robot": shown.robot,
+            "task": demonstration.task,
+            "robot": demonstration.robot,
             "seconds": seconds,
             "simulated_seconds": attempted * config.duration,
             "config": config.to_json(),
-            "references": dict(shown.references),
+            "references": dict(demonstration.references),
         }
     )

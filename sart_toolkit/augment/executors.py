@@ -1,4 +1,4 @@
-"""Carries segments out on a robot: planned, proved clear, executed, checked, and reversed."""
+"""Executes segments on a robot: planned, proved clear, executed, checked, and reversed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _FROM_STATES = "segments start from the demonstration's saved states"
 class Attempt:
     """The outcome of an attempt: the episode, or the reason why it was rejected.
 
-    `outcome` is the same for all attempts that fail alike; `detail` tells this one's figures.
+    `outcome` is the same for all attempts that fail alike; `detail` gives this one's figures.
     """
 
     key: AttemptKey
@@ -77,7 +77,7 @@ class SegmentExecutor(abc.ABC):
 
         Raises:
             UnknownName: the backend has no such camera.
-            MissingCapability: pictures are wanted and the backend takes none.
+            MissingCapability: images are wanted and the backend takes none.
             Mismatch: a demonstration was recorded at other rates.
         """
         for demonstration in demonstrations:
@@ -125,7 +125,7 @@ class RestoreExecutor(SegmentExecutor):
 
         Raises:
             UnknownName: the backend has no such camera.
-            MissingCapability: the backend can't restore states, or pictures are wanted and it
+            MissingCapability: the backend can't restore states, or images are wanted and it
                 takes none.
             Mismatch: a demonstration holds no saved states, or was recorded at other rates.
         """
@@ -261,7 +261,7 @@ def check_untouched(scene: SceneSpec, contacts: Sequence[Contact], grasped: froz
     """Return if nothing touched during the last step that should not.
 
     Raises:
-        MotionRejected: the robot touched itself, or it or what it carries touched something else.
+        MotionRejected: the robot touched itself, or it or what it grasps touched something else.
     """
     touching = [(contact.a, contact.b) for contact in contacts]
     bodies = {body.name for body in scene.bodies}
@@ -273,12 +273,12 @@ def check_untouched(scene: SceneSpec, contacts: Sequence[Contact], grasped: froz
 
 def check_undisturbed(
     scene: SceneSpec,
-    carried: frozenset[str],
+    grasped: frozenset[str],
     start: Observation,
     end: Observation,
     slip_tolerance: float,
 ) -> None:
-    """Return if what is carried stayed in the grasp and all else where it was.
+    """Return if what is grasped stayed in the grasp and all else where it was.
 
     Raises:
         MotionRejected: it didn't.
@@ -288,7 +288,7 @@ def check_undisturbed(
             continue
         Ts = [seen.Ts_world_body[body.name] for seen in (start, end)]
         most = _MOVED
-        if body.name in carried:
+        if body.name in grasped:
             most = slip_tolerance
             Ts = [inverse(seen.T_world_tool) @ T for seen, T in zip((start, end), Ts, strict=True)]
         # The farthest that any point of the body has moved.
@@ -296,7 +296,7 @@ def check_undisturbed(
         moved = corners @ (Ts[1] - Ts[0])[:3, :3].T + (Ts[1] - Ts[0])[:3, 3]
         far = float(np.linalg.norm(moved, axis=1).max())
         if far > most:
-            what = "slipped in the grasp" if body.name in carried else "was moved"
+            what = "slipped in the grasp" if body.name in grasped else "was moved"
             raise MotionRejected(f"{body.name} {what}: by {far * 1e3:.1f} mm")
 
 

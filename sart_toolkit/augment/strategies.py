@@ -49,7 +49,7 @@ class Strategy(abc.ABC):
         """A segment drawn for a sphere of a demonstration.
 
         Args:
-            demonstration: what was shown.
+            demonstration: the recorded demonstration.
             sphere: one of its precision spheres.
             rng: the only source of what is random.
             config: how poses are drawn.

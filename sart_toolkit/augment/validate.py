@@ -37,7 +37,7 @@ _POSE_TOLERANCE = 1e-6
 class Validation:
     """What came of checking a dataset.
 
-    `episodes`: how many were looked at; `problems`: what doesn't hold, by the episode's file;
+    `episodes`: how many were checked; `problems`: what doesn't hold, by the episode's file;
     `least_clearance` [m]: the smallest that the certificates of the commanded and
     of the measured paths prove, `largest_deviation` [m] of the measured paths from the commanded.
     """

@@ -46,7 +46,7 @@ def make_backend(
         backend: its class, or a name or reference that names it.
         robot: the robot.
         scene: what surrounds it.
-        image_size: width and height of pictures [pixels]; one number for a square.
+        image_size: width and height of images [pixels]; one number for a square.
         rates: how often it is commanded, measured and recorded.
 
     Raises:

@@ -25,7 +25,7 @@ from sart_toolkit.scenes.spec import SceneSpec, SceneState
 
 @dataclass(frozen=True)
 class CameraView:
-    """One picture: `rgb (H,W,3)` uint8, `depth (H,W)` float32 [m] along z, 0 where nothing was hit.
+    """One image: `rgb (H,W,3)` uint8, `depth (H,W)` float32 [m] along z, 0 where nothing was hit.
 
     `T_world_camera (4,4)`: where it was taken from, z forward, x right, y down.
     """
@@ -40,7 +40,7 @@ class Observation:
     """What the robot measures now.
 
     `q`, `dq (n,)` [rad, rad/s]; `gripper` in [0, 1]; `T_world_tool (4,4)`; `time` [s] since the
-    start or the last reset; `cameras` holds the pictures asked for; `Ts_world_body` where the
+    start or the last reset; `cameras` holds the images asked for; `Ts_world_body` where the
     bodies are, held ones too, as `KnowsBodies.body_poses` has them (empty without that ability).
     `joint_path (m, n)` [rad]: where the joints were during the last control period, measured as
     often as the backend can (our simulators: after each physics step), oldest first, the last row
@@ -89,13 +89,13 @@ class Backend(abc.ABC):
     Attributes:
         robot: the robot's specification.
         scene: what surrounds it.
-        image_size: width and height of pictures [pixels].
+        image_size: width and height of images [pixels].
         rates: how often it is commanded, measured and recorded.
-        no_pictures: why `observe` takes no pictures (here); empty where it does.
+        no_images: why `observe` takes no images (here); empty where it does.
     """
 
     name: str
-    no_pictures: str = ""
+    no_images: str = ""
 
     def __init__(
         self,
@@ -115,34 +115,34 @@ class Backend(abc.ABC):
         return {c.name: c for c in (*self.robot.cameras, *self.scene.cameras)}
 
     def check_cameras(self, names: Sequence[str]) -> None:
-        """Return if pictures of the named cameras can be taken.
+        """Return if images of the named cameras can be taken.
 
         Raises:
             UnknownName: there is no such camera.
-            MissingCapability: this backend takes no pictures.
+            MissingCapability: this backend takes no images.
         """
         known = self.cameras
         for name in names:
             if name not in known:
                 raise unknown_name("camera", name, known)
-        if names and self.no_pictures:
+        if names and self.no_images:
             raise MissingCapability(
-                f"backend {self.name!r} takes no pictures: {self.no_pictures}; use another backend"
+                f"backend {self.name!r} takes no images: {self.no_images}; use another backend"
             )
 
     @abc.abstractmethod
     def observe(
         self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
     ) -> Observation:
-        """Measure joints, gripper and tool, with pictures of the named cameras.
+        """Measure joints, gripper and tool, with images of the named cameras.
 
         Args:
-            cameras: names of the cameras whose pictures are wanted.
-            image_size: width and height of the pictures, where not the backend's own.
+            cameras: names of the cameras whose images are wanted.
+            image_size: width and height of the images, where not the backend's own.
 
         Raises:
             UnknownName: no such camera.
-            MissingCapability: pictures are asked for where it takes none.
+            MissingCapability: images are asked for where it takes none.
         """
 
     @abc.abstractmethod
@@ -205,7 +205,7 @@ class SavesStates(abc.ABC):
 
 
 class SensesForce(abc.ABC):
-    """Can feel how hard it is pressed."""
+    """Senses the contact force."""
 
     @abc.abstractmethod
     def force(self) -> float:
@@ -213,7 +213,7 @@ class SensesForce(abc.ABC):
 
 
 class SensesContacts(SensesForce):
-    """Can tell which bodies touch, and so how hard."""
+    """Knows which bodies touch, and so how hard."""
 
     @abc.abstractmethod
     def contacts(self) -> list[Contact]:
@@ -229,7 +229,7 @@ class SensesContacts(SensesForce):
 
 
 class KnowsBodies(abc.ABC):
-    """Can tell where the bodies are: those of the scene and those that the robot holds."""
+    """Knows where the bodies are: those of the scene and those that the robot holds."""
 
     @abc.abstractmethod
     def body_poses(self) -> dict[str, Array]:
@@ -244,7 +244,7 @@ class Draws(abc.ABC):
 
     @abc.abstractmethod
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
-        """A picture of a state by a camera, which need not be one of the backend's.
+        """An image of a state by a camera, which need not be one of the backend's.
 
         Nothing else changes: robot and bodies stay as they are.
 

@@ -1,4 +1,4 @@
-"""PyBullet behind the `Backend` interface, with all abilities; pictures by its CPU renderer."""
+"""PyBullet behind the `Backend` interface, with all abilities; images by its CPU renderer."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
         self._target = self._last_target = np.zeros(n + 1)
         # Another world with the same in it, where states are drawn.
         self._stage: PyBulletBackend | None = None
-        # The bytes restored last, until something changes: Bullet numbers contacts anew each time.
+        # The bytes restored last, until something changes: Bullet renumbers contacts each time.
         self._restored: bytes | None = None
 
     def _load_bodies(self, root: Body) -> None:
@@ -254,7 +254,7 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
             gripper=c.getJointState(self._robot, self._driver)[0] / closed,
             T_world_tool=self._frame_pose(self.robot.tool_frame),
             time=self._time,
-            cameras={name: self._picture(self.cameras[name], *size) for name in cameras},
+            cameras={name: self._image(self.cameras[name], *size) for name in cameras},
             Ts_world_body=self.body_poses(),
             joint_path=np.array(self._joint_path),
         )
@@ -285,9 +285,9 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
         if self._stage is None:
             self._stage = type(self)(self.robot, self.scene, self.image_size, self.rates)
         self._stage._place(dataclasses.replace(state, q=q))
-        return self._stage._picture(camera, *check_image_size((width, height)))
+        return self._stage._image(camera, *check_image_size((width, height)))
 
-    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+    def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
         T_world_camera = self._frame_pose(camera.frame) @ camera.T_frame_camera
         near, far, light = camera.near, camera.far, self.scene.light
         view = inverse(T_world_camera @ _FLIP)
@@ -391,7 +391,7 @@ class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies,
         head, world = unpack_state(
             self.name, state, self.robot.name, self._scene_digest, sorted(self._bodies)
         )
-        # Contacts that are there already would keep forces that the file doesn't have.
+        # Existing contacts would keep forces that the file doesn't have.
         self._forget_contacts()
         handle, path = tempfile.mkstemp(suffix=".bullet")
         try:
@@ -444,7 +444,7 @@ def _urdf_file(root: Body, moving: Iterable[Body]) -> Iterator[str]:
 def _projection(fov_y_deg: float, near: float, far: float, width: int, height: int) -> list[float]:
     """OpenGL's matrix, half a pixel off: TinyRenderer samples each pixel at its lower left corner.
 
-    So (0, 0) of the picture is the centre of its first pixel, as `CameraSpec.intrinsics` says.
+    So (0, 0) of the image is the centre of its first pixel, as `CameraSpec.intrinsics` says.
     """
     matrix = list(p.computeProjectionMatrixFOV(fov_y_deg, width / height, near, far))
     matrix[8] += 1.0 / width

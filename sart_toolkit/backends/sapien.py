@@ -24,14 +24,14 @@ from sart_toolkit.backends.interface import (
     SavesStates,
     SensesContacts,
 )
-from sart_toolkit.backends.sapien_pictures import (
+from sart_toolkit.backends.sapien_renderer import (
     ALONG_Z,
     REMEDY,
-    Pictures,
+    Renderer,
     sapien,
     sapien_axis,
     sapien_pose,
-    why_no_pictures,
+    why_no_images,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
 from sart_toolkit.collision.model import primitive
@@ -117,11 +117,11 @@ class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, D
     friction between two bodies is the mean of their coefficients.
 
     PhysX remembers contacts in ways that can't be saved. So every `reset` and `restore` builds the
-    physics anew, and what follows depends on the state alone, to the bit; but the motion after a
+    physics, and what follows depends on the state alone, to the bit; but the motion after a
     `save` and the one after its `restore` may differ by `drift`.
 
-    Physics needs no graphics. Where SAPIEN can't draw, `no_pictures` of the instance says why, and
-    so does asking for a picture.
+    Physics needs no graphics. Where SAPIEN can't draw, `no_images` of the instance says why, and
+    so does asking for an image.
     """
 
     name = "sapien"
@@ -141,9 +141,9 @@ class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, D
             InvalidInput: the robot's URDF has joints or shapes that this backend doesn't know.
         """
         super().__init__(robot, scene, image_size, rates)
-        why = why_no_pictures()
-        self.no_pictures = f"SAPIEN can't draw here ({why}); {REMEDY}" if why else ""
-        self._pictures: Pictures | None = None
+        why = why_no_images()
+        self.no_images = f"SAPIEN can't draw here ({why}); {REMEDY}" if why else ""
+        self._renderer: Renderer | None = None
         self._model = RobotModel(robot, scene.held)
         self._robot = _ConvexParts(robot, self._model)
         self._scene_digest = scene_digest(self._model, scene)
@@ -177,7 +177,7 @@ class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, D
         )
 
     def _start(self, moment: _Moment, target: Array) -> None:
-        """Build the physics anew with everything as it is at a moment, and time 0."""
+        """Rebuild the physics with everything as it is at a moment, and time 0."""
         self._now = moment
         self._physics = _Physics(self._robot, self.scene, moment, self.rates.physics_hz)
         self._target = self._last_target = target
@@ -225,8 +225,8 @@ class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, D
         self._running()
         q = self._model.check_limits(state.q)
         self.scene.check_state(state)
-        if self.no_pictures:
-            raise MissingCapability(self.no_pictures)
+        if self.no_images:
+            raise MissingCapability(self.no_images)
         self._robot.place(self._robot.q_all(q, state.gripper))
         size = check_image_size((width, height))
         return self._take([camera], size, state.Ts_world_body)[camera.name]
@@ -237,14 +237,14 @@ class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, D
         size: tuple[int, int],
         Ts_world_body: Mapping[str, Array],
     ) -> dict[str, CameraView]:
-        """Pictures of the robot as last placed, and of bodies at poses `(4, 4)`."""
+        """Images of the robot as last placed, and of bodies at poses `(4, 4)`."""
         if not cameras:
             return {}
         robot = self._robot
-        if self._pictures is None:
-            self._pictures = Pictures(robot.geometry(pin.GeometryType.VISUAL), self.scene)
+        if self._renderer is None:
+            self._renderer = Renderer(robot.geometry(pin.GeometryType.VISUAL), self.scene)
         placed = [(camera, robot.frame_pose(camera.frame)) for camera in cameras]
-        return self._pictures.take(placed, size, robot.joint_poses(), Ts_world_body)
+        return self._renderer.take(placed, size, robot.joint_poses(), Ts_world_body)
 
     def command(self, q: Array, gripper: float) -> CommandSent:
         self._running()
@@ -294,7 +294,7 @@ class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, D
         self._periods = int(head["periods"])
 
     def close(self) -> None:
-        self._physics = self._pictures = None
+        self._physics = self._renderer = None
 
 
 class _ConvexParts:

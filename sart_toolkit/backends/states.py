@@ -17,7 +17,7 @@ _VERSION = 4
 
 
 def scene_digest(model: RobotModel, scene: SceneSpec) -> str:
-    """A hash of robot, shapes, joints and gravity; not of looks, nor of where bodies stand.
+    """A hash of robot, shapes, joints and gravity; not of appearance, nor of where bodies stand.
 
     Args:
         model: the robot with what it holds.

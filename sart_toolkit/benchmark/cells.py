@@ -15,9 +15,9 @@ from sart_toolkit.record.session import SessionConfig, record_demonstration
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks.task import Placement, Task
 
-# Where only the outcome is asked for, neither pictures nor states are kept.
+# Where only the outcome is asked for, neither images nor states are kept.
 BLIND = SessionConfig(cameras=(), keep_states=False)
-WITHOUT_PICTURES = SessionConfig(cameras=())
+WITHOUT_IMAGES = SessionConfig(cameras=())
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ def demonstrate(
 
 
 def recorded(
-    cell: Cell, backend: Backend, seed: int, config: SessionConfig = WITHOUT_PICTURES
+    cell: Cell, backend: Backend, seed: int, config: SessionConfig = WITHOUT_IMAGES
 ) -> Demonstration:
-    """The scripted operator's demonstration of a cell's task, without pictures if not asked for.
+    """The scripted operator's demonstration of a cell's task, without images if not asked for.
 
     Raises:
         Mismatch: it did not reach the goal.
@@ -59,10 +59,10 @@ def recorded(
     rng = np.random.default_rng([seed, 0])
     placement = cell.task.sample_placement(rng)
     model = RobotModel(backend.robot, backend.scene.held)
-    shown = demonstrate(cell.task, backend, model, placement, rng, config)
-    if not cell.task.achieved(shown.success, shown.rates.record_hz):
+    demonstration = demonstrate(cell.task, backend, model, placement, rng, config)
+    if not cell.task.achieved(demonstration.success, demonstration.rates.record_hz):
         raise Mismatch(f"{cell.name}: the demonstration did not reach the goal; try another --seed")
-    return shown
+    return demonstration
 
 
 def check_counts(config: Any, *names: str) -> None:

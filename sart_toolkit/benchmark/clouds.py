@@ -1,4 +1,4 @@
-"""How radii from the recorded pictures compare with those from the true scene, task by task."""
+"""How radii from the recorded images compare with those from the true scene, task by task."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def benchmark_clouds(
     the robot's moving parts, or what it holds, at any waypoint until then.
 
     Args:
-        cells: tasks and backends; the backends draw pictures.
+        cells: tasks and backends; the backends draw images.
         seed: of the scripted operator.
         progress: called with (cells done, cells in all).
     """
@@ -83,20 +83,20 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
         model = RobotModel(robot, task.scene.held)
         plan = task.plan(task.initial_state(model, Placement()))
         operator = ScriptedOperator(plan, np.random.default_rng(seed))
-        shown = record_demonstration(backend, task, model, operator, seed=seed)
-    exact = ExactWorld(shown, robot, task.scene)
+        demonstration = record_demonstration(backend, task, model, operator, seed=seed)
+    exact = ExactWorld(demonstration, robot, task.scene)
     started = time.perf_counter()
-    annotation = suggest_annotation(shown, exact)
+    annotation = suggest_annotation(demonstration, exact)
     seconds_exact = time.perf_counter() - started
-    cloud = CloudWorld(shown, robot, task.scene)
+    cloud = CloudWorld(demonstration, robot, task.scene)
     started = time.perf_counter()
-    tiled = suggest_annotation(shown, cloud)
+    tiled = suggest_annotation(demonstration, cloud)
     seconds_cloud = time.perf_counter() - started
     config = SuggestConfig(min_radius=_LEAST_RADIUS)
     spheres: list[dict[str, Any]] = []
     for sphere in annotation.spheres:
         of = {
-            name: suggest_radius(world, shown, sphere.waypoint, config)
+            name: suggest_radius(world, demonstration, sphere.waypoint, config)
             for name, world in (("exact", exact), ("cloud", cloud))
         }
         spheres.append(
@@ -105,12 +105,13 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
             | {f"{name}_limited_by": found.limited_by for name, found in of.items()}
         )
     still = next(
-        (t for t, phase in enumerate(exact.phases) if phase.contacts or phase.grasped), len(shown)
+        (t for t, phase in enumerate(exact.phases) if phase.contacts or phase.grasped),
+        len(demonstration),
     )
     errors = None
     if still > 1:
-        fused = fuse_cloud(shown, robot, task.scene.held, range(still))
-        bodies = {name: Ts[0] for name, Ts in shown.body_Ts_world.items()}
+        fused = fuse_cloud(demonstration, robot, task.scene.held, range(still))
+        bodies = {name: Ts[0] for name, Ts in demonstration.body_Ts_world.items()}
         seen = dataclasses.replace(
             fused,
             points=fused.points[~fused.behind],
@@ -126,7 +127,7 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
             "on_robot": _on_robot(seen.points, exact, range(still)),
         }
     return {
-        "waypoints": len(shown),
+        "waypoints": len(demonstration),
         "seconds_exact": seconds_exact,
         "seconds_cloud": seconds_cloud,
         "n_spheres_exact": len(annotation.spheres),

@@ -54,12 +54,12 @@ class _Operator:
         started = time.perf_counter()
         row = {"cell": name, "episode": episode, "placement": placement.to_json()}
         try:
-            shown = demonstrate(cell.task, backend, model, placement, rng, BLIND)
-            success = cell.task.achieved(shown.success, shown.rates.record_hz)
+            demonstration = demonstrate(cell.task, backend, model, placement, rng, BLIND)
+            success = cell.task.achieved(demonstration.success, demonstration.rates.record_hz)
             row |= {
                 "success": success,
-                "seconds": float(shown.timestamps[-1]),
-                "force": float(np.nanmax(shown.steps.contact_force)),
+                "seconds": float(demonstration.timestamps[-1]),
+                "force": float(np.nanmax(demonstration.steps.contact_force)),
                 "reason": None if success else cell.task.failure_reason(backend.observe()),
             }
         except SartError as error:
@@ -83,7 +83,7 @@ def benchmark_operator(
     """Success rates of the scripted operator over random placements, cell by cell, without cameras.
 
     An episode succeeds when the goal is reached at its end and has been for the task's `hold`.
-    Finished episodes are kept beside `out` until all are done: interrupted, it goes on there.
+    Finished episodes are kept beside `out` until all are done: interrupted, it resumes there.
 
     Args:
         cells: tasks on backends.

@@ -33,8 +33,8 @@ from sart_toolkit.workers import worker_map
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _LARGEST_STEP = 1.5
 _SUGGESTIONS = 5
-# Directed draws: part pairs looked at, draws before the best is refined, and how much deeper [m] a
-# collision must be than the last one that did not hold before the whole robot is tried again.
+# Directed draws: part pairs considered, draws before the best is refined, and how much deeper [m] a
+# collision must be than the last one that did not hold before the whole robot is checked again.
 _PAIRS = 12
 _EXPLORED = 200
 _DEEPER = 2e-5
@@ -63,9 +63,9 @@ class Checker(Protocol):
         self,
         Ts_world_body: Mapping[str, Array],
         gripper: float,
-        T_tool_carried: Mapping[str, Array] = ...,
+        T_tool_grasped: Mapping[str, Array] = ...,
     ) -> None:
-        """Put bodies and gripper where they are; what is carried moves with the tool."""
+        """Put bodies and gripper where they are; what is grasped moves with the tool."""
 
     def nearest(self, q: Array, within: float = ...) -> Nearest:
         """The nearest pair of the whole robot at joints `q (n,)`, if nearer than `within` [m]."""
@@ -79,7 +79,7 @@ MakeChecker = Callable[[RobotSpec, SceneSpec], Checker]
 
 @dataclass(frozen=True)
 class RadiiConfig:
-    """How suggested radii are tried.
+    """How suggested radii are tested.
 
     `draws`: random poses in each sphere; `directed`: draws that aim at the pair of bodies that
     limits a sphere, in one of `growth` times the radius; `suggest`: how radii are suggested.
@@ -98,17 +98,17 @@ class RadiiConfig:
 
 
 class SphereTrial:
-    """Tries spheres of a demonstration: random poses within, directed ones in a larger one."""
+    """Tests spheres of a demonstration: random poses within, directed ones in a larger one."""
 
     def __init__(self, world: ExactWorld, checker: Checker, config: RadiiConfig) -> None:
-        """Try spheres in a world; `checker` is asked as well as the world's own model."""
+        """Test spheres in a world; `checker` is asked as well as the world's own model."""
         self._world, self._checker, self._config = world, checker, config
 
     def __call__(self, sphere: PrecisionSphere, rng: np.random.Generator) -> dict[str, Any]:
         """What became of a sphere's draws, as JSON values; distances in millimetres.
 
         `collisions` counts poses at which one of the two models of the whole robot overlaps, with
-        what is carried where it was in the grasp. `within_margin` tells whether a directed draw
+        what is grasped where it was in the grasp. `within_margin` says whether a directed draw
         came nearer than the margin, and the slip tolerance, that a suggested radius leaves.
         """
         t = sphere.waypoint
@@ -175,7 +175,7 @@ class SphereTrial:
     def _directed(self, sphere: PrecisionSphere, rng: np.random.Generator) -> dict[str, Any] | None:
         """What an aimed search finds in the grown sphere; None if no pair of bodies limits it.
 
-        Only tool bodies and the scene are looked at, until some overlap; the whole robot, by both
+        Only tool bodies and the scene are considered, until some overlap; the whole robot, by both
         models, has to agree.
         """
         t = sphere.waypoint
@@ -187,11 +187,11 @@ class SphereTrial:
         angle = self._config.suggest.rotation_per_metre * radius
         q_key = self._world.demonstration.steps.joint_positions[t]
         search = _Search(placed, q_key, limiting, radius, angle, rng)
-        tried, found = 0.0, False
+        checked, found = 0.0, False
         while search.draws < self._config.directed and not found:
             d, T = search.draw()
-            if d < tried:
-                tried = d - _DEEPER
+            if d < checked:
+                checked = d - _DEEPER
                 q = self._joints(t, T)
                 found = (
                     q is not None
@@ -309,7 +309,7 @@ def _within(vector: Array, most: float) -> Array:
 
 
 class _Radii:
-    """Tries all spheres of a cell."""
+    """Tests all spheres of a cell."""
 
     def __init__(
         self, cells: Sequence[Cell], make_checker: MakeChecker, config: RadiiConfig
@@ -320,17 +320,17 @@ class _Radii:
     def __call__(self, name: str) -> dict[str, Any]:
         cell, config = self._cells[name], self._config
         with closing(cell.make_backend()) as backend:
-            shown = recorded(cell, backend, config.seed)
+            demonstration = recorded(cell, backend, config.seed)
             robot, bodies = backend.robot, backend.scene
         started = time.perf_counter()
-        world = ExactWorld(shown, robot, bodies)
-        for t in range(len(shown)):
+        world = ExactWorld(demonstration, robot, bodies)
+        for t in range(len(demonstration)):
             world.placed(t)
         built = time.perf_counter() - started
         seconds = []
         for _ in range(1 + _SUGGESTIONS):
             started = time.perf_counter()
-            annotation = suggest_annotation(shown, world, config=config.suggest)
+            annotation = suggest_annotation(demonstration, world, config=config.suggest)
             seconds.append(time.perf_counter() - started)
         rows = []
         with closing(self._make_checker(robot, bodies)) as checker:
@@ -339,7 +339,7 @@ class _Radii:
                 rows.append(attempt(sphere, np.random.default_rng([config.seed, i])))
         return {
             "cell": name,
-            "waypoints": len(shown),
+            "waypoints": len(demonstration),
             "seconds_build": built,
             "seconds_suggest_first": seconds[0],
             "seconds_suggest": float(np.median(seconds[1:])),
@@ -366,7 +366,7 @@ def benchmark_radii(
     Safe: random poses in each sphere, as augmentation draws them and within the ball too, are free
     of collisions of the whole robot, by our own model and by another. Tight: in a somewhat larger
     sphere a search that aims finds one, where a pair of bodies limits the radius. Finished cells
-    are kept beside `out` until all are done: interrupted, it goes on there.
+    are kept beside `out` until all are done: interrupted, it resumes there.
 
     Args:
         cells: tasks on backends.

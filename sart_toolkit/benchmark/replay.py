@@ -24,8 +24,8 @@ def benchmark_replay(
     """What a demonstration's commands do on every other backend, object placed the same.
 
     For each task a demonstration is recorded on each of its backends and replayed on the others.
-    Rows tell the greatest difference of the measured tool poses over all recorded steps at which
-    neither run's robot, or what it carries, touched anything else.
+    Rows give the greatest difference of the measured tool poses over all recorded steps at which
+    neither run's robot, or what it grasps, touched anything else.
 
     Args:
         cells: tasks on backends.
@@ -38,17 +38,19 @@ def benchmark_replay(
     pairs = [(a, b) for a, b in itertools.permutations(cells, 2) if a.task.name == b.task.name]
     if not pairs:
         raise InvalidInput("replay: needs two backends to compare, got one; name another")
-    shown: dict[str, Demonstration] = {}
+    demonstrations: dict[str, Demonstration] = {}
     rows = []
     for done, (source, target) in enumerate(pairs, 1):
         task = source.task
         rng = np.random.default_rng([seed, 0])
         placement = task.sample_placement(rng)
-        if source.name not in shown:
+        if source.name not in demonstrations:
             with closing(source.make_backend()) as backend:
                 model = RobotModel(backend.robot, backend.scene.held)
-                shown[source.name] = demonstrate(task, backend, model, placement, rng, BLIND)
-        original = shown[source.name]
+                demonstrations[source.name] = demonstrate(
+                    task, backend, model, placement, rng, BLIND
+                )
+        original = demonstrations[source.name]
         with closing(target.make_backend()) as backend:
             model = RobotModel(backend.robot, backend.scene.held)
             copy = replay_demonstration(original, backend, task, model, BLIND)

@@ -24,7 +24,7 @@ class ResultLog:
     """
 
     def __init__(self, out: Path, request: Mapping[str, Any], overwrite: bool) -> None:
-        """Go on where the same `request` was interrupted, or start.
+        """Resume where the same `request` was interrupted, or start.
 
         Raises:
             OutputExists: `out` is there and `overwrite` is false.

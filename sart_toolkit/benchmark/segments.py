@@ -18,7 +18,7 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.benchmark.cells import WITHOUT_PICTURES, Cell, check_counts, recorded
+from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision.world import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
@@ -37,7 +37,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.workers import worker_map
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
-# Rounding lets a law that just fills a limit exceed it by less than this share.
+# Rounding lets a timing that just meets a limit exceed it by less than this fraction.
 _ROUNDING = 1e-9
 
 
@@ -55,7 +55,7 @@ class SegmentsConfig:
 
 @dataclass(frozen=True)
 class LimitCheck:
-    """How a motion fares against the robot's limits, and what is commanded against its path.
+    """How a motion compares with the robot's limits, and what is commanded against its path.
 
     `ratios`: the greatest joint velocity, acceleration and jerk over their limits, at any physics
     step; `violations`: how many of these samples, joints counted singly, exceed theirs. `off` [m]:
@@ -103,7 +103,7 @@ def _tool_points(model: RobotModel, configurations: Array) -> Array:
 
 
 class _Segments:
-    """Makes tries of a cell; keeps the last cell's backend, demonstration and spheres."""
+    """Makes attempts of a cell; keeps the last cell's backend, demonstration and spheres."""
 
     def __init__(self, cells: Sequence[Cell], config: SegmentsConfig) -> None:
         self._cells = {cell.name: cell for cell in cells}
@@ -117,11 +117,11 @@ class _Segments:
             backend = cell.make_backend()
             try:
                 exact = self._augment.obstacles == "scene"
-                session = WITHOUT_PICTURES if exact else SessionConfig()
-                shown = recorded(cell, backend, self._augment.seed, session)
-                world = world_of(shown, backend.robot, backend.scene, self._augment)
-                annotation = suggest_annotation(shown, world)
-                executor = RestoreExecutor(backend, [(shown, annotation)], self._augment)
+                session = WITHOUT_IMAGES if exact else SessionConfig()
+                demonstration = recorded(cell, backend, self._augment.seed, session)
+                world = world_of(demonstration, backend.robot, backend.scene, self._augment)
+                annotation = suggest_annotation(demonstration, world)
+                executor = RestoreExecutor(backend, [(demonstration, annotation)], self._augment)
             except BaseException:
                 backend.close()
                 raise
@@ -135,11 +135,11 @@ class _Segments:
         sphere = annotation.spheres[at]
         started = time.perf_counter()
         proposal, rng = planner.proposal(at, k)
-        model, shown = planner.world.kinematics, planner.world.demonstration
+        model, demonstration = planner.world.kinematics, planner.world.demonstration
         motion: Motion | None = None
         row: dict[str, Any] = {
             "cell": name,
-            "try": number,
+            "attempt": number,
             "sphere": at,
             "k": k,
             "waypoint": sphere.waypoint,
@@ -153,8 +153,8 @@ class _Segments:
         except (Unreachable, MotionRejected):
             pass
         else:
-            commanded = shown.steps.commanded_joint_positions
-            found = check_motion(model, motion, commanded[proposal.t_star], shown.rates)
+            commanded = demonstration.steps.commanded_joint_positions
+            found = check_motion(model, motion, commanded[proposal.t_star], demonstration.rates)
             row["planned"] = {
                 "clearance": certificate.clearance,
                 "duration": motion.duration,
@@ -168,7 +168,9 @@ class _Segments:
             row["measured"] = {
                 "clearance": proof["measured"]["clearance"],
                 "deviation": proof["deviation"],
-                "off": tool_off_path(model, motion, attempt.episode.joint_path, shown.rates),
+                "off": tool_off_path(
+                    model, motion, attempt.episode.joint_path, demonstration.rates
+                ),
             }
         return row | {"wall": time.perf_counter() - started}
 
@@ -187,26 +189,26 @@ def benchmark_segments(
     progress: Callable[[int, int, int], None] | None = None,
     about: Mapping[str, Any] = _NOTHING,
 ) -> dict[str, Any]:
-    """How augmentation's segments fare in simulation, and whether they keep what they promise.
+    """How augmentation's segments perform in simulation, and whether they keep what they promise.
 
     For each cell a demonstration of the scripted operator is recorded and spheres are suggested;
     the attempts are shared evenly among the cells, and go round-robin over a cell's spheres. No
-    pictures are taken but those that the obstacles are known from. Finished attempts are kept
+    images are taken but those that the obstacles are known from. Finished attempts are kept
     beside `out` until all are done: interrupted, it resumes.
 
     Args:
         cells: tasks on backends.
-        config: how many tries.
+        config: how many attempts.
         out: JSON file to write.
         workers: processes.
-        overwrite: replace `out`, and forget finished tries.
-        progress: called with (done, wanted, kept) after each try.
+        overwrite: replace `out`, and forget finished attempts.
+        progress: called with (done, wanted, kept) after each attempt.
         about: what else is to stand in the file, such as the command.
 
     Raises:
         OutputExists: `out` is there and `overwrite` is false.
         Mismatch: it was interrupted with another seed or obstacles, or a demonstration failed.
-        InvalidInput: there are fewer tries than cells.
+        InvalidInput: there are fewer attempts than cells.
         MissingCapability: a backend can't restore states.
         CannotWrite: the disk refuses.
     """
@@ -216,7 +218,7 @@ def benchmark_segments(
     wanted = [(cell.name, i) for n, cell in enumerate(cells) for i in range(share + (n < rest))]
     asked = {"benchmark": "segments", "seed": config.seed, "obstacles": config.obstacles}
     log = ResultLog(out, asked, overwrite)
-    rows = {(row["cell"], row["try"]): row for row in log.rows}
+    rows = {(row["cell"], row["attempt"]): row for row in log.rows}
     missing = [item for item in wanted if item not in rows]
     done = len(wanted) - len(missing)
     kept = sum(rows[item]["outcome"] == KEPT for item in wanted if item in rows)

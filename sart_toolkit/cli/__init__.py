@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         say(f"sart: error: {error}")
         sys.exit(2)
     except ImportError as error:
-        say(f"sart: error: {error}; `sart doctor` tells what is missing and how to fix it")
+        say(f"sart: error: {error}; `sart doctor` says what is missing and how to fix it")
         sys.exit(2)
     except KeyboardInterrupt:
         say("sart: interrupted; finished parts are kept, type the same command again to resume")

@@ -55,7 +55,7 @@ def annotate_verb(args: Annotate) -> dict[str, Any]:
         journal_path = out.with_name(f"{out.name}.journal")
         if headless and journal_path.exists() and not args.overwrite:
             raise OutputExists(
-                f"{journal_path}: holds an interrupted session's changes; go on with `sart "
+                f"{journal_path}: holds an interrupted session's changes; resume it with `sart "
                 "annotate`, or add --overwrite"
             )
         check_writable(out, overwrite=args.overwrite or not headless)
@@ -88,7 +88,7 @@ def annotate_verb(args: Annotate) -> dict[str, Any]:
         else:
             _window_mode(session)
     if session.dirty and not session.done:
-        say(f"not saved: type the same command again to go on ({journal_path} keeps it)")
+        say(f"not saved: type the same command again to resume ({journal_path} keeps it)")
     return {
         "annotation": str(out) if out.exists() else None,
         "saved": not session.dirty,
@@ -118,7 +118,7 @@ def _annotation_at(path: Path, demonstration: Demonstration) -> Annotation:
         annotation.check_matches(demonstration)
     except Mismatch as error:
         raise Mismatch(
-            f"{path}: {error}; begin anew with --overwrite, or choose another --out"
+            f"{path}: {error}; start again with --overwrite, or choose another --out"
         ) from error
     return annotation
 
@@ -130,6 +130,6 @@ def _check_done(session: AnnotationSession) -> None:
 
 def _window_mode(session: AnnotationSession) -> None:
     window = importlib.import_module("sart_toolkit.annotate.open3d_window")
-    shown = session.demonstration
-    scene = pipeline.task_of(shown).scene
-    window.annotate_in_window(session, pipeline.robot_of(shown), scene)
+    demonstration = session.demonstration
+    scene = pipeline.task_of(demonstration).scene
+    window.annotate_in_window(session, pipeline.robot_of(demonstration), scene)

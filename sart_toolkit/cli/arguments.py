@@ -38,10 +38,10 @@ _EPOCHS = Annotated[int | None, _optional("INT", "Training epochs; the policy's 
 _WORKERS = Annotated[int, arg(help="Processes to use.")]
 _SEED = Annotated[int, arg(help="Seed of everything random in this step.")]
 _IMAGE = Annotated[
-    str, arg(help="Size of recorded pictures [pixels]: 128, or width and height as in 160x120.")
+    str, arg(help="Size of recorded images [pixels]: 128, or width and height as in 160x120.")
 ]
 _CAMERAS = Annotated[
-    str, arg(help="Cameras to record and learn from, with commas between, such as wrist,overview.")
+    str, arg(help="Cameras to record and learn from, comma-separated, such as wrist,overview.")
 ]
 _DEVICE = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Where the policy runs.")]
 _STRATEGY = Annotated[
@@ -58,15 +58,17 @@ _POLICY = Annotated[
 ]
 _N = Annotated[int, arg(help="Trajectories in all, the demonstration among them.")]
 _EPISODES = Annotated[int, arg(help="Rollouts with random placements.")]
-_EVAL_SEED = Annotated[int, arg(help="Seed of the placements, apart from training's.")]
+_EVAL_SEED = Annotated[int, arg(help="Seed of the placements, separate from training's.")]
 _YAW = Annotated[
     float, arg(help="Also turn the object, uniformly within ± this [deg]; the paper does not.")
 ]
-_LOOKS = Annotated[bool, arg(help="Vary colours, light and the wrist camera's mounting at random.")]
-_TASKS = Annotated[str, arg(help="Names of tasks with commas between, or all.")]
-_BACKENDS = Annotated[str, arg(help="Names of backends with commas between, or all.")]
+_APPEARANCE = Annotated[
+    bool, arg(help="Vary colours, light and the wrist camera's mounting at random.")
+]
+_TASKS = Annotated[str, arg(help="Comma-separated names of tasks, or all.")]
+_BACKENDS = Annotated[str, arg(help="Comma-separated names of backends, or all.")]
 _SLIP_TOLERANCE = Annotated[
-    float, arg(help="How far what is grasped may move in the grasp [m]; so much more is kept free.")
+    float, arg(help="In-grasp slip tolerance [m]: so much more is kept clear of a grasped object.")
 ]
 _SOURCE = Annotated[
     Literal["scene", "cloud"],
@@ -76,9 +78,9 @@ _UNKNOWN = Annotated[
     Literal["behind", "free"],
     arg(help="With --source cloud: space behind what was seen counts as solid, or as free."),
 ]
-_TOOL_MARGIN = Annotated[float, arg(help="Distance that stays free of the tool everywhere [m].")]
-_MIN_RADIUS = Annotated[float, arg(help="Smallest sphere worth having [m].")]
-_MAX_RADIUS = Annotated[float, arg(help="Largest sphere [m].")]
+_TOOL_MARGIN = Annotated[float, arg(help="Distance kept free around the tool [m].")]
+_MIN_RADIUS = Annotated[float, arg(help="Smallest radius of a sphere [m].")]
+_MAX_RADIUS = Annotated[float, arg(help="Largest radius of a sphere [m].")]
 _DISTRIBUTION = Annotated[
     Literal["paper", "area"],
     arg(help="How positions are drawn on a sphere: as the paper says, or uniform over its area."),
@@ -134,7 +136,10 @@ class Record:
     task: _TASK
     out: Annotated[Path, arg(help="HDF5 file to write.")]
     device: Annotated[
-        str, arg(metavar="REF", help="What steers: keyboard, spacemouse, gamepad, or scripted.")
+        str,
+        arg(
+            metavar="REF", help="What steers: keyboard, spacemouse, gamepad, scripted, or your own."
+        ),
     ] = "scripted"
     backend: _BACKEND = "pybullet"
     robot: _ROBOT = None
@@ -162,7 +167,7 @@ class Record:
         Literal["middle", "random"], arg(help="Where the object stands in its range.")
     ] = "middle"
     yaw_deg: _YAW = 0.0
-    vary_looks: _LOOKS = False
+    vary_appearance: _APPEARANCE = False
     image_size: _IMAGE = "128"
     cameras: _CAMERAS = "wrist"
     overwrite: _OVERWRITE = False
@@ -171,7 +176,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Play:
-    """Look at a demonstration or an episode again, in a window or as an MP4 film.
+    """Look at a demonstration or an episode again, in a window or as an MP4 video.
 
     Example: sart play demo.h5
 
@@ -189,7 +194,7 @@ class Play:
     camera: Annotated[
         str, arg(help="A camera of the scene, drawn again; or a recorded one, such as wrist.")
     ] = "overview"
-    speed: Annotated[float, arg(help="Times real time.")] = 1.0
+    speed: Annotated[float, arg(help="Playback speed; 1 is real time.")] = 1.0
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
     backend: _NOTED_BACKEND = None
@@ -297,7 +302,7 @@ class Augment:
     strategy: _STRATEGY = "sart"
     allocation: Annotated[
         Literal["radius", "equal"],
-        arg(help="How spheres share the trajectories: by their radii, or equally as in the paper."),
+        arg(help="Allocation of trajectories to spheres: by radius, or equally as in the paper."),
     ] = "radius"
     distribution: _DISTRIBUTION = "paper"
     rotation_per_metre: Annotated[
@@ -356,13 +361,13 @@ class Train:
     batch_size: Annotated[int | None, _optional("INT", "The policy's own if left out.")] = None
     image_size: Annotated[
         int | None,
-        _optional("INT", "Pictures are scaled to this [pixels]; the policy's own if left out."),
+        _optional("INT", "Images are scaled to this [pixels]; the policy's own if left out."),
     ] = None
     image_shift: Annotated[
         int | None,
         _optional(
             "INT",
-            "Random shift of the pictures, up to this [pixels]; the policy's own if left out.",
+            "Random shift of the images, up to this [pixels]; the policy's own if left out.",
         ),
     ] = None
     cameras: _CAMERAS = "wrist"
@@ -391,11 +396,11 @@ class Train:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Try a skill on random placements.
+    """Evaluate a skill on random placements.
 
     Example: sart evaluate skill --out evaluation.json --episodes 100 --workers 2
 
-    Example: sart evaluate skill --out looks.json --vary-looks --yaw-deg 15
+    Example: sart evaluate skill --out varied.json --vary-appearance --yaw-deg 15
     """
 
     skill: Annotated[Positional[Path], arg(metavar="SKILL", help="Directory from `sart train`.")]
@@ -406,7 +411,7 @@ class Evaluate:
     episodes: _EPISODES = 50
     eval_seed: _EVAL_SEED = 1000
     yaw_deg: _YAW = 0.0
-    vary_looks: _LOOKS = False
+    vary_appearance: _APPEARANCE = False
     videos: Annotated[int, arg(help="Videos of the first successes, and as many of failures.")] = 2
     workers: _WORKERS = 2
     device: _DEVICE = "cpu"
@@ -426,7 +431,9 @@ class BenchmarkOperator:
 
     tasks: _TASKS = "all"
     backends: _BACKENDS = "all"
-    episodes: Annotated[int, arg(help="Episodes with random placements, a task and backend.")] = 100
+    episodes: Annotated[
+        int, arg(help="Episodes with random placements, for each task and backend.")
+    ] = 100
     seed: _SEED = 0
     yaw_deg: _YAW = 0.0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_operator.json")
@@ -437,7 +444,7 @@ class BenchmarkOperator:
 
 @dataclass(frozen=True)
 class BenchmarkReplay:
-    """How a demonstration recorded on one backend fares when its commands are given on another.
+    """How well a demonstration recorded on one backend replays on another.
 
     Example: sart benchmark replay --tasks all --backends pybullet,sapien --out replay.json
     """
@@ -452,10 +459,10 @@ class BenchmarkReplay:
 
 @dataclass(frozen=True)
 class BenchmarkSegments:
-    """How augmentation's segments fare: kept, touched, off their path, beyond the joints' limits.
+    """How augmentation's segments perform: kept, touched, off their path, beyond joint limits.
 
     On each task and backend a demonstration is recorded, spheres are suggested, and segments are
-    attempted from them in turn, without pictures. With --source cloud spheres and segments are
+    attempted from them in turn, without images. With --source cloud spheres and segments are
     proved against what the demonstration's camera saw, and executed in the true scene.
 
     Example: sart benchmark segments --tasks all --backends pybullet --count 10000
@@ -469,7 +476,9 @@ class BenchmarkSegments:
 
     tasks: _TASKS = "all"
     backends: _BACKENDS = "all"
-    count: Annotated[int, arg(help="Segments to try, shared by tasks and backends.")] = 10_000
+    count: Annotated[int, arg(help="Segments to attempt, divided among tasks and backends.")] = (
+        10_000
+    )
     source: _SOURCE = "scene"
     seed: _SEED = 0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_segments.json")
@@ -493,7 +502,7 @@ class BenchmarkRadii:
     tasks: _TASKS = "all"
     backends: _BACKENDS = "pybullet"
     draws: Annotated[int, arg(help="Random poses in each sphere.")] = 2000
-    directed: Annotated[int, arg(help="Draws that aim, in each grown sphere.")] = 20_000
+    directed: Annotated[int, arg(help="Directed draws in each enlarged sphere.")] = 20_000
     seed: _SEED = 0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_radii.json")
     workers: _WORKERS = 2
@@ -503,7 +512,7 @@ class BenchmarkRadii:
 
 @dataclass(frozen=True)
 class BenchmarkCloud:
-    """How radii from the recorded pictures compare with those from the true scene.
+    """How radii from the recorded images compare with those from the true scene.
 
     Example: sart benchmark cloud --tasks all --out cloud.json
     """
@@ -545,7 +554,7 @@ class BenchmarkSkill:
 
 @dataclass(frozen=True)
 class Report:
-    """Write the page about a run: pictures, videos and figures in one HTML file.
+    """Write the page about a run: images, videos and figures in one HTML file.
 
     Example: sart report runs/peg
 
@@ -584,6 +593,6 @@ class Doctor:
     """
 
     full: Annotated[
-        bool, arg(help="Also try out torch, SAPIEN, windows and devices, which takes longer.")
+        bool, arg(help="Also test torch, SAPIEN, windows and devices, which takes longer.")
     ] = False
     json: _JSON = False

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _UNITS = {
     "record": "s",
-    "play": "picture",
+    "play": "image",
     "suggest": "waypoint",
     "augment": "trajectory",
     "validate": "episode",

@@ -21,11 +21,11 @@ def doctor_verb(args: Doctor) -> dict[str, Any]:
     else:
         for finding in findings:
             mark = "ok  " if finding.ok else ("FAIL" if finding.required else "off ")
-            mark = mark if finding.tried else "?   "
+            mark = mark if finding.tested else "?   "
             remedy = f"\n      -> {finding.remedy}" if finding.remedy and not finding.ok else ""
             result[f"{mark} {finding.name}"] = f"{finding.detail}{remedy}"
         if not args.full:
-            result["?"] = "is installed; `sart doctor --full` tries it out"
+            result["?"] = "is installed; `sart doctor --full` tests it"
     if not usable:
         show(result, args.json)
         sys.exit(1)

@@ -1,4 +1,4 @@
-"""`sart play`: which recording a path names, and window or film."""
+"""`sart play`: which recording a path names, and window or video."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ def play_verb(args: Play) -> dict[str, Any]:
     pipeline.check_names(task=args.task, robot=args.robot, backend=args.backend)
     check_play_options(args)
     playback = load_playback(args.file)
-    shown = playback.demonstration
-    if args.camera in shown.steps.cameras:
+    demonstration = playback.demonstration
+    if args.camera in demonstration.steps.cameras:
         playback.camera = args.camera
         return play(args, playback, None)
     from sart_toolkit.report.player import SceneView
 
-    size = pipeline.image_size_of(shown)
-    make = pipeline.backend_maker(shown, size, shown.rates, args.task, args.robot, args.backend)
+    size = pipeline.image_size_of(demonstration)
+    make = pipeline.backend_maker(
+        demonstration, size, demonstration.rates, args.task, args.robot, args.backend
+    )
     with closing(make()) as backend:
         return play(args, playback, SceneView(playback, backend, args.camera))
 
@@ -78,8 +80,8 @@ def check_play_options(args: Play) -> None:
     """Refuse what can't be done before anything is drawn.
 
     Raises:
-        InvalidInput: the speed is not positive, or the film's name doesn't end in .mp4.
-        OutputExists, CannotWrite: the film can't be written.
+        InvalidInput: the speed is not positive, or the video's name doesn't end in .mp4.
+        OutputExists, CannotWrite: the video can't be written.
     """
     check_positive("speed", args.speed)
     if args.out is not None:
@@ -89,7 +91,7 @@ def check_play_options(args: Play) -> None:
 
 
 def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, Any]:
-    """What was played: in a window until it was closed, or into a film."""
+    """What was played: in a window until it was closed, or into a video."""
     said = {
         "played": str(args.file),
         "kind": "episode" if playback.split else "demonstration",
@@ -115,4 +117,4 @@ def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, A
                 progress("play", i, len(playback))
 
         write_video(args.out, counted(), playback.hz * args.speed)
-    return said | {"film": str(args.out)}
+    return said | {"video": str(args.out)}

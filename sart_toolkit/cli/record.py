@@ -33,7 +33,7 @@ def record_verb(args: Record) -> dict[str, Any]:
             max_seconds=args.max_seconds,
             placement=args.placement,
             yaw_deg=args.yaw_deg,
-            vary_looks=args.vary_looks,
+            vary_appearance=args.vary_appearance,
             cameras=args.cameras.split(","),
             image_size=args.image_size,
             seed=args.seed,

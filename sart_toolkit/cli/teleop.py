@@ -40,7 +40,7 @@ def record_by_hand(
 
     Raises:
         Discarded: the person threw it away.
-        MissingCapability: the backend takes no pictures.
+        MissingCapability: the backend takes no images.
         UnknownName: there is no such camera.
         DeviceLost: there is nothing to steer with.
         NoDisplay: no window can be opened.

@@ -44,7 +44,7 @@ def evaluate_verb(args: Evaluate) -> dict[str, Any]:
             eval_seed=args.eval_seed,
             videos=args.videos,
             yaw_deg=args.yaw_deg,
-            vary_looks=args.vary_looks,
+            vary_appearance=args.vary_appearance,
             task=args.task,
             robot=args.robot,
             backend=args.backend,

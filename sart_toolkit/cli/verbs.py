@@ -102,7 +102,7 @@ def overview(of: str = "") -> str:
             "",
             *lines,
             "",
-            "sart VERB --help tells what a verb takes, with examples; sart --version the version.",
+            "sart VERB --help says what a verb takes, with examples; sart --version the version.",
             "Example: sart run peg_in_hole --out runs/peg",
         ]
     )

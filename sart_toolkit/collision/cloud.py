@@ -1,8 +1,8 @@
 """The scene as a wrist camera saw it: a coloured point cloud, and distances from it to the robot.
 
 A real cell has no scene description. What a demonstration recorded stands in for one: depth
-pictures, fused into points with the camera's pose known from the arm, the robot's own pixels taken
-out, and a rule for the space that no picture shows.
+images, fused into points with the camera's pose known from the arm, the robot's own pixels taken
+out, and a rule for the space that no image shows.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape
 from sart_toolkit.scenes.spec import SceneSpec
 
-# A picture looks through a point when all it sees around it lies farther by this.
+# An image sees through a point when everything around it is farther by this.
 _THROUGH_VOXELS, _THROUGH_SHARE = 2.0, 0.03
-# Between two pictures used the camera has moved or turned by at least this [m, rad].
+# Between two images used the camera has moved or turned by at least this [m, rad].
 _STEP, _TURN = 0.02, np.deg2rad(6.0)
-_MAX_PICTURES = 14
+_MAX_IMAGES = 14
 # How far from the tool what it took away may reach, and how far it must have moved [m].
 _GRASPED_REACH, _GRASPED_AWAY = 0.15, 0.03
 
 
 @dataclass(frozen=True)
 class CloudConfig:
-    """How pictures become a cloud; lengths in [m].
+    """How images become a cloud; lengths in [m].
 
     `voxel`: points in one cell of this grid are merged into their mean. `near`, `far`: depth that
     is used. `reach`: points farther than this from every tool position shown are left out: no
     radius and no tool is large enough to get there. `self_margin`: points nearer than this to the
     robot's convex parts are its own pixels.
 
-    `unknown` is the rule for space that no picture shows: "free", or "behind": solid to a depth of
-    `behind` along the ray behind what was seen, except where a picture looks through it or the
+    `unknown` is the rule for space that no image shows: "free", or "behind": solid to a depth of
+    `behind` along the ray behind what was seen, except where an image sees through it or the
     robot itself was.
 
     `inflation`: every point stands for a ball of this radius, for what lies between pixels. It is
@@ -89,7 +89,7 @@ class SceneCloud:
     """Points of a scene `(n, 3)` [m] in the world, their `colours (n, 3)` uint8.
 
     `behind (n,)`: the point was not seen but filled in by the rule for unknown space; of such
-    points only the outer layer is kept. `config` tells how the cloud was made.
+    points only the outer layer is kept. `config` says how the cloud was made.
     """
 
     points: Array
@@ -214,7 +214,7 @@ def _joint_frames(model: RobotModel, q: Array) -> list[Array]:
 
 @dataclass(frozen=True)
 class _View:
-    """One depth picture: its waypoint, where its camera was, what it says."""
+    """One depth image: its waypoint, where its camera was, what it says."""
 
     waypoint: int
     T_world_camera: Array
@@ -248,7 +248,7 @@ class _View:
         return p @ T[:3, :3].T + T[:3, 3], self.rgb[v, u]
 
     def project(self, p_world: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-        """Rows of those points that fall into the picture; their pixels' index and their depth."""
+        """Rows of those points that fall into the image; their pixels' index and their depth."""
         T = self.T_world_camera
         p = (p_world - T[:3, 3]) @ T[:3, :3]
         ahead = np.flatnonzero(p[:, 2] > 1e-6)
@@ -259,16 +259,16 @@ class _View:
         return ahead[inside], uv[inside, 1] * width + uv[inside, 0], p[inside, 2]
 
     def through(self, p_world: Array, voxel: float) -> NDArray[np.bool_]:
-        """Which points `(n, 3)` the picture looks through: all it sees there lies behind them."""
+        """Which points `(n, 3)` the image sees through: all it sees there lies behind them."""
         rows, pixels, z = self.project(p_world)
         result = np.zeros(len(p_world), dtype=bool)
         result[rows] = self.nearest.ravel()[pixels] > z + _tolerance(z, voxel)
         return result
 
     def misfit(self, p_world: Array, voxel: float) -> Array:
-        """How far `(n,)` [m] points are from what the picture shows at their pixels.
+        """How far `(n,)` [m] points are from what the image shows at their pixels.
 
-        It is the tolerance at most, and NaN where the picture tells nothing: outside of it, where
+        It is the tolerance at most, and NaN where the image shows nothing: outside of it, where
         it has no depth, and behind something nearer.
         """
         rows, pixels, z = self.project(p_world)
@@ -291,24 +291,24 @@ def fuse_cloud(
     config: CloudConfig | None = None,
     grasped: Sequence[GraspedObject] = (),
 ) -> SceneCloud:
-    """The coloured point cloud of the scene that the wrist pictures at some waypoints show.
+    """The coloured point cloud of the scene that the wrist images at some waypoints show.
 
-    Pictures are chosen by how far the camera has moved. The robot's own pixels and those of what
-    it grasped are dropped, and points that a later picture looks through: what was there has
+    Images are chosen by how far the camera has moved. The robot's own pixels and those of what
+    it grasped are dropped, and points that a later image sees through: what was there has
     moved, or was noise.
 
     Args:
         demonstration: what was recorded, with depth.
         robot: the robot that recorded it.
         held: bodies fixed to it.
-        waypoints: whose pictures are used, all if left out. What isn't grasped should stand still.
+        waypoints: whose images are used, all if left out. What isn't grasped should stand still.
         config: grid, ranges and rules.
         grasped: what the gripper grasped; it is no part of the scene, neither in its grasp nor
             where it was taken from.
 
     Raises:
         InvalidInput: no camera or no depth was recorded, a waypoint is out of range, or the
-            pictures show nothing within range and reach.
+            images show nothing within range and reach.
         Mismatch: another robot recorded it.
     """
     config = config or CloudConfig()
@@ -328,7 +328,7 @@ def fuse_cloud(
         raise InvalidInput(
             f"cloud: expected something {config.near} to {config.far} m before the camera and "
             f"within {config.reach} m of the tool besides the robot, got nothing; look at the "
-            "pictures, or change near, far or reach"
+            "images, or change near, far or reach"
         )
     points, colours = cells.points[keep], cells.colours[keep]
     behind = np.zeros(len(points), dtype=bool)
@@ -343,7 +343,7 @@ def fuse_cloud(
 def _views(
     demonstration: Demonstration, robot: RobotSpec, waypoints: Sequence[int] | None
 ) -> list[_View]:
-    """The pictures at those of the waypoints between which the camera has moved."""
+    """The images at those of the waypoints between which the camera has moved."""
     if demonstration.robot != robot.name:
         raise Mismatch(
             f"cloud: the demonstration was recorded by {demonstration.robot!r}, got "
@@ -364,8 +364,8 @@ def _views(
             keys.append(t)
     if keys[-1] != chosen[-1]:
         keys.append(chosen[-1])
-    if len(keys) > _MAX_PICTURES:
-        keys = [keys[i] for i in np.linspace(0, len(keys) - 1, _MAX_PICTURES).round().astype(int)]
+    if len(keys) > _MAX_IMAGES:
+        keys = [keys[i] for i in np.linspace(0, len(keys) - 1, _MAX_IMAGES).round().astype(int)]
     views = [_View.of(demonstration, camera, t) for t in keys for camera in cameras.values()]
     if not any(view.depth.any() for view in views):
         raise InvalidInput(
@@ -387,14 +387,14 @@ def _checked_waypoints(demonstration: Demonstration, waypoints: Sequence[int] | 
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Points `(n, 3)` of the pictures that aren't the robot, their colours and grid cells.
+    """Points `(n, 3)` of the images that aren't the robot, their colours and grid cells.
 
-    `picture (n,)` is the index of the picture, `cell (n,)` the number of the cell.
+    `image (n,)` is the index of the image, `cell (n,)` the number of the cell.
     """
 
     points: Array
     colours: Image
-    picture: NDArray[np.int64]
+    image: NDArray[np.int64]
     cell: NDArray[np.int64]
 
 
@@ -402,7 +402,7 @@ class _Pixels:
 class _Cells:
     """The cells that pixels fell into, by increasing number `(n,)`: mean point, mean colour.
 
-    `last (n,)` is the last waypoint at which a picture saw something in it.
+    `last (n,)` is the last waypoint at which an image saw something in it.
     """
 
     numbers: NDArray[np.int64]
@@ -418,9 +418,9 @@ def _scene_pixels(views: Sequence[_View], own: _OwnBody, config: CloudConfig) ->
         other = ~own.covers(p, view.waypoint, config.self_margin)
         points.append(p[other])
         colours.append(colour[other])
-    picture = np.repeat(np.arange(len(views)), [len(p) for p in points])
+    image = np.repeat(np.arange(len(views)), [len(p) for p in points])
     p = np.concatenate(points)
-    return _Pixels(p, np.concatenate(colours), picture, _cell_numbers(p, config.voxel))
+    return _Pixels(p, np.concatenate(colours), image, _cell_numbers(p, config.voxel))
 
 
 def _merged(pixels: _Pixels, views: Sequence[_View], config: CloudConfig) -> _Cells:
@@ -431,12 +431,12 @@ def _merged(pixels: _Pixels, views: Sequence[_View], config: CloudConfig) -> _Ce
     points = np.add.reduceat(pixels.points[order], first) / counts[:, None]
     colours = np.add.reduceat(pixels.colours[order].astype(np.int64), first) // counts[:, None]
     waypoints = np.array([view.waypoint for view in views])
-    last = np.maximum.reduceat(waypoints[pixels.picture[order]], first)
+    last = np.maximum.reduceat(waypoints[pixels.image[order]], first)
     return _Cells(numbers, points, colours.astype(np.uint8), last)
 
 
 def _moved_away(cells: _Cells, views: Sequence[_View], config: CloudConfig) -> NDArray[np.bool_]:
-    """Which cells `(n,)` a later picture looks through."""
+    """Which cells `(n,)` a later image sees through."""
     gone = np.zeros(len(cells.points), dtype=bool)
     for view in views:
         rows = np.flatnonzero(~gone & (cells.last < view.waypoint))
@@ -454,15 +454,15 @@ def _filled(
 ) -> tuple[Array, NDArray[np.int64]]:
     """The outer layer of what lies hidden behind the kept cells, and which cell each is behind.
 
-    Cells that a picture looks through, or where the robot was itself, aren't hidden.
+    Cells that an image sees through, or where the robot was itself, aren't hidden.
     """
     seen = cells.numbers[keep]
     row = np.searchsorted(cells.numbers, pixels.cell)
     depths = np.append(np.arange(config.voxel, config.behind, config.voxel), config.behind)
     numbers, sources = [], []
     for index, view in enumerate(views):
-        mine = np.flatnonzero((pixels.picture == index) & keep[row])
-        # One ray a cell and picture.
+        mine = np.flatnonzero((pixels.image == index) & keep[row])
+        # One ray a cell and image.
         mine = mine[np.unique(row[mine], return_index=True)[1]]
         rays = pixels.points[mine] - view.T_world_camera[:3, 3]
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -511,18 +511,18 @@ def _cell_centres(numbers: NDArray[np.int64], voxel: float) -> Array:
 
 
 class _MeanMisfit:
-    """The mean of points' misfits over the pictures that tell of them."""
+    """The mean of points' misfits over the images that show them."""
 
     def __init__(self, n: int) -> None:
         self._sum, self._count = np.zeros(n), np.zeros(n)
 
     def add(self, misfits: Array) -> None:
-        told = np.isfinite(misfits)
-        self._sum[told] += misfits[told]
-        self._count[told] += 1
+        measured = np.isfinite(misfits)
+        self._sum[measured] += misfits[measured]
+        self._count[measured] += 1
 
     def mean(self) -> Array:
-        """The means `(n,)` [m], infinite where no picture tells."""
+        """The means `(n,)` [m], infinite where no image shows them."""
         return np.where(self._count > 0, self._sum / np.maximum(self._count, 1), np.inf)
 
 
@@ -536,8 +536,8 @@ def grasped_object(
 ) -> GraspedObject | None:
     """What the gripper took away, as points in the tool frame; None if it took nothing.
 
-    Of the points near the tool those belong to it that rode along with the tool in the pictures of
-    `after`, and those seen in `before` that pictures of `after` look through. Without `before`
+    Of the points near the tool those belong to it that rode along with the tool in the images of
+    `after`, and those seen in `before` that images of `after` see through. Without `before`
     only the side towards the camera is known; it is then taken to be `config.behind` deep, away
     from the camera and across the tool's axis (unless `config.unknown` is "free").
 
@@ -603,7 +603,7 @@ def surface_errors(
     Args:
         cloud: the cloud.
         scene: bodies with their shapes, those that are only drawn included.
-        Ts_world_body: their poses `(4, 4)` when the pictures were taken.
+        Ts_world_body: their poses `(4, 4)` when the images were taken.
 
     Raises:
         UnknownName: a body's pose is missing.

@@ -1,4 +1,4 @@
-"""The world as the recorded pictures show it, where nothing else is known of the scene."""
+"""The world as the recorded images show it, where nothing else is known of the scene."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class _Seen(NamedTuple):
 
 
 class CloudWorld(CollisionWorld):
-    """Robot and obstacles, these as the demonstration's pictures show them.
+    """Robot and obstacles, these as the demonstration's images show them.
 
     A run of waypoints in which nothing new is touched, grasped or let go has a cloud of its own,
-    from its own pictures: what was seen earlier may have been moved since. What is grasped counts
-    as a part of the tool, its shape taken from the pictures before and after it was lifted.
+    from its own images: what was seen earlier may have been moved since. What is grasped counts
+    as a part of the tool, its shape taken from the images before and after it was lifted.
     """
 
     def __init__(
@@ -52,15 +52,15 @@ class CloudWorld(CollisionWorld):
         slip_tolerance: float = IN_GRASP_SLIP,
         config: CloudConfig | None = None,
     ) -> None:
-        """Take the pictures of a demonstration; they are looked at when a waypoint is asked about.
+        """Take the images of a demonstration; they are processed when a waypoint is asked about.
 
         Args:
-            demonstration: what was shown and seen.
+            demonstration: the recorded demonstration.
             robot: the robot that was steered.
-            scene: tells what is fixed to the robot and which bodies can be lifted; where its bodies
-                are and what shape they have is not looked at.
+            scene: says what is fixed to the robot and which bodies can be lifted; where its bodies
+                are and what shape they have is not used.
             slip_tolerance: how far [m] what is grasped may move in the grasp.
-            config: how pictures become a cloud.
+            config: how images become a cloud.
 
         Raises:
             Mismatch: the demonstration is of another robot.
@@ -69,7 +69,7 @@ class CloudWorld(CollisionWorld):
         self._robot, self._held = robot, scene.held
         self._config = config or CloudConfig()
         self._collision = CollisionModel(robot, SceneSpec((), scene.held))
-        self._looked: dict[range, _Seen] = {}
+        self._runs_seen: dict[range, _Seen] = {}
         self._shapes: dict[range, GraspedObject | None] = {}
         self._placed: dict[int, PlacedModel] = {}
 
@@ -82,7 +82,7 @@ class CloudWorld(CollisionWorld):
         """The robot with what it has grasped, and the cloud, as at waypoint `t`.
 
         Raises:
-            InvalidInput: the demonstration holds no depth pictures, or they show nothing near.
+            InvalidInput: the demonstration holds no depth images, or they show nothing near.
         """
         if t not in self._placed:
             seen = self._seen(self._run(t))
@@ -96,7 +96,7 @@ class CloudWorld(CollisionWorld):
         return self._placed[t]
 
     def moving(self, t: int) -> str | None:
-        """Always `None`: pictures of one moment don't tell what moves."""
+        """Always `None`: images of one moment don't show what moves."""
         return None
 
     def unknown(self, t: int) -> str | None:
@@ -118,12 +118,12 @@ class CloudWorld(CollisionWorld):
         return range(first, end)
 
     def _seen(self, run: range) -> _Seen:
-        """What the pictures of a run of waypoints show."""
-        if run not in self._looked:
-            self._looked[run] = self._look(run)
-        return self._looked[run]
+        """What the images of a run of waypoints show."""
+        if run not in self._runs_seen:
+            self._runs_seen[run] = self._process(run)
+        return self._runs_seen[run]
 
-    def _look(self, run: range) -> _Seen:
+    def _process(self, run: range) -> _Seen:
         grasped = self._own_shape(run)
         if grasped is None:
             others = (o for o in self._same_grasp(run) if self._own_shape(o) is not None)
@@ -147,7 +147,7 @@ class CloudWorld(CollisionWorld):
         return fuse_cloud(*about, run, self._config, grasped)
 
     def _own_shape(self, run: range) -> GraspedObject | None:
-        """What was in the grasp in a run of waypoints, as its own pictures show it."""
+        """What was in the grasp in a run of waypoints, as its own images show it."""
         if not self.phases[run.start].grasped:
             return None
         if run not in self._shapes:

@@ -37,7 +37,7 @@ class ExactWorld(CollisionWorld):
         """Read the geometry of robot and scene.
 
         Args:
-            demonstration: what was shown.
+            demonstration: the recorded demonstration.
             robot: the robot that was steered.
             scene: the task's scene.
             slip_tolerance: how far [m] a grasped object may move in the grasp; that much more is

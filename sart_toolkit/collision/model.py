@@ -163,7 +163,7 @@ class CollisionModel:
         """The model with the scene's bodies, the gripper and what it grasps put in their places.
 
         Args:
-            Ts_world_body: poses `(4, 4)` of the scene's bodies; a grasped one's isn't looked at.
+            Ts_world_body: poses `(4, 4)` of the scene's bodies; a grasped one's is ignored.
             gripper: opening in [0, 1].
             Ts_tool_grasped: poses `(4, 4)` in the tool frame of the bodies in the grasp.
             allowed: pairs of names that may touch, about which nothing is said.
@@ -401,7 +401,7 @@ class PlacedModel:
     def near_pairs(self, q: Array, within: float) -> list[int]:
         """All pairs, by index, that are nearer than `within` [m] at `q (n,)`, and perhaps others.
 
-        Those that rough bounds tell to be farther away are left out.
+        Those that rough bounds show to be farther away are left out.
         """
         placed = self.bounds.placed(self.joint_poses(q)[None])
         every = np.arange(len(self.pairs))
@@ -489,7 +489,7 @@ class Bounds:
         parts, n = model.parts, len(model.kinematics.spec.arm_joints)
         self._cloud, self._convex_pairs = model.cloud, model.convex_pairs
         self.first: Index = model.pairs[:, 0]
-        # What no box encloses has any box here; it isn't looked at.
+        # What no box encloses has any box here; it is ignored.
         self.second: Index = np.where(model.pairs[:, 1] < len(parts), model.pairs[:, 1], 0)
         self._joints = model.joints[:-1]
         self._centres = np.array([part.sphere[0] for part in parts]).reshape(-1, 3, 1)

@@ -42,7 +42,7 @@ class CloudObstacles:
             InvalidInput: the cloud has no points.
         """
         if not len(cloud):
-            raise InvalidInput("cloud: expected at least one point, got none; look at the pictures")
+            raise InvalidInput("cloud: expected at least one point, got none; look at the images")
         self._points = cloud.points
         self._tree = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False)
         self._inflation = cloud.config.inflation

@@ -46,5 +46,5 @@ def demonstration_phases(
         grasped = scene.grasped(touching, robot.gripper.finger_links)
         contacts = scene.outer_contacts(touching, grasped)
         phases.append(Phase(round(float(command), 2), grasped, contacts))
-    # Before the first step nothing has been felt yet.
+    # Before the first step no contacts are known yet.
     return (dataclasses.replace(phases[1], gripper=phases[0].gripper), *phases[1:])

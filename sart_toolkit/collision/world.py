@@ -26,7 +26,7 @@ class CollisionWorld(ABC):
     """Robot and obstacles as they were at each waypoint of a demonstration.
 
     Attributes:
-        demonstration: what was shown.
+        demonstration: the recorded demonstration.
         phases: the phase of each waypoint.
         slip_tolerance: how far [m] a grasped object may move in the grasp.
     """
@@ -38,7 +38,7 @@ class CollisionWorld(ABC):
         scene: SceneSpec,
         slip_tolerance: float,
     ) -> None:
-        """Tell the demonstration's phases apart.
+        """Find the demonstration's phases.
 
         Raises:
             Mismatch: the demonstration is of another robot.
@@ -113,17 +113,17 @@ def make_world(
     slip_tolerance: float = IN_GRASP_SLIP,
     cloud: CloudConfig | None = None,
 ) -> CollisionWorld:
-    """The obstacles of a demonstration from the scene's geometry, or from what cameras saw alone.
+    """The obstacles of a demonstration from the scene's geometry, or from recorded images alone.
 
     Args:
         source: "scene": the bodies of `scene`, where the demonstration has them; "cloud": the
             recorded RGB-D.
-        demonstration: what was shown.
+        demonstration: the recorded demonstration.
         robot: the robot that was steered.
-        scene: the task's scene; of "cloud", only what is fixed to the robot is looked at, and the
+        scene: the task's scene; of "cloud", only what is fixed to the robot is used, and the
             names of the bodies that can be lifted.
         slip_tolerance: how far [m] a grasped object may move in the grasp.
-        cloud: how pictures become a cloud.
+        cloud: how images become a cloud.
 
     Raises:
         UnknownName: no such source.

@@ -1,7 +1,7 @@
 """The manifest of a dataset: what it was asked for, and how each attempt ended.
 
 A file of JSON lines that only grows. The first says what was asked for and of which demonstrations;
-each further one how an attempt ended. Where two tell of one attempt the later counts.
+each further one how an attempt ended. Where two are of one attempt the later counts.
 """
 
 from __future__ import annotations

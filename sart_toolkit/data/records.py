@@ -181,7 +181,7 @@ class CameraRecord:
 
     def __repr__(self) -> str:
         n, height, width, _ = self.rgb.shape
-        return summary(self, pictures=n, width=width, height=height)
+        return summary(self, images=n, width=width, height=height)
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Steps:
         object.__setattr__(self, "contact_force", frozen(force))
         for name, camera in self.cameras.items():
             if len(camera.rgb) != n:
-                raise InvalidInput(f"camera {name!r}: expected {n} pictures, got {len(camera.rgb)}")
+                raise InvalidInput(f"camera {name!r}: expected {n} images, got {len(camera.rgb)}")
         object.__setattr__(self, "cameras", dict(self.cameras))
 
     def __len__(self) -> int:
@@ -350,7 +350,7 @@ class Demonstration(Referring):
         )
 
     def content_hash(self) -> str:
-        """SHA-256 over what was shown: steps, bodies, commands, task, robot; not saved states."""
+        """SHA-256 over the recording: steps, bodies, commands, task, robot; not saved states."""
         return digest(
             {
                 **self.steps.content(),
@@ -372,7 +372,7 @@ class PrecisionSphere:
     """How far the tool may stray around one key waypoint: radius [m] about `T_world_key (4,4)`.
 
     `waypoint` is the index of the key waypoint in the demonstration. `clearance` [m] and
-    `limited_by` tell what backed a suggested radius: the distance of the pair of bodies that
+    `limited_by` say what backed a suggested radius: the distance of the pair of bodies that
     bounds it.
     """
 

@@ -55,7 +55,7 @@ def _cannot_write(path: Path) -> Iterator[None]:
         raise
     except PermissionError as error:
         raise CannotWrite(
-            f"{path}: permission denied; choose another --out or mend its permissions"
+            f"{path}: permission denied; choose another --out or fix its permissions"
         ) from error
     except OSError as error:
         raise CannotWrite(
@@ -128,7 +128,7 @@ def read_json(path: Path) -> dict[str, Any]:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise BrokenFile(
-            f"{path}: not readable as JSON ({error}); mend or make it again"
+            f"{path}: not readable as JSON ({error}); fix it or make it again"
         ) from error
     except OSError as error:
         raise BrokenFile(f"{path}: {error.strerror}; check the path and its permissions") from error
@@ -183,7 +183,7 @@ class Journal:
         except OSError as error:
             self._file.close()
             raise CannotWrite(
-                f"{self.path}: another process is at work on it; end that one first, or choose "
+                f"{self.path}: another process is using it; end that one first, or choose "
                 "another --out"
             ) from error
         self._file.seek(0)
@@ -380,7 +380,7 @@ def _put_steps(group: h5py.Group, steps: Steps) -> None:
         group[name] = getattr(steps, name)
     for name, camera in steps.cameras.items():
         at = group.create_group(f"cameras/{name}")
-        # One chunk a picture, LZF: a tenth of gzip's time, and a step can be read by itself.
+        # One chunk an image, LZF: a tenth of gzip's time, and a step can be read by itself.
         for part, frames in (("rgb", camera.rgb), ("depth", camera.depth)):
             at.create_dataset(
                 part, data=frames, chunks=(1, *frames.shape[1:]), compression="lzf", shuffle=True

@@ -108,7 +108,7 @@ class DatasetWriter:
         request: Mapping[str, Any],
         overwrite: bool = False,
     ) -> None:
-        """Open a dataset directory to generate, or to go on generating, what is asked for.
+        """Open a dataset directory to generate, or resume generating, what is asked for.
 
         Args:
             path: the directory; made if needed.
@@ -158,7 +158,7 @@ class DatasetWriter:
         self._journal.close()
 
     def _opened(self, wanted: Manifest, overwrite: bool) -> Manifest:
-        """The manifest to go on with; a directory that is overwritten is cleared."""
+        """The manifest to continue; a directory that is overwritten is cleared."""
         journal = self._journal
         if journal.rows and not overwrite:
             found = Manifest.from_rows(journal.path, journal.rows)

@@ -1,4 +1,4 @@
-"""Seeded rollouts of a skill, what came of each, and the first of either outcome for a film."""
+"""Seeded rollouts of a skill, the outcome of each, and the first of either outcome for a video."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.learn.skill import Skill, load_skill
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scenes.appearance import vary_appearance
+from sart_toolkit.scenes.appearance import randomise_appearance
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.workers import worker_map
 
@@ -50,7 +50,7 @@ class Moment:
     success: bool
 
 
-# Makes a film, at a path, of a rollout's moments at a rate [1/s], its number and its outcome.
+# Makes a video, at a path, of a rollout's moments at a rate [1/s], its number and its outcome.
 Film = Callable[[Path, Sequence[Moment], float, int, Literal["success", "failure"]], object]
 
 
@@ -58,7 +58,7 @@ Film = Callable[[Path, Sequence[Moment], float, int, Literal["success", "failure
 class EvaluateConfig:
     """How a skill is evaluated: number of rollouts, their seed, how many of each outcome to film.
 
-    `yaw_deg`: objects are also turned, uniformly within ± this [deg]; with `vary_looks` colours,
+    `yaw_deg`: objects also turn, uniformly within ± this [deg]; with `vary_appearance` colours,
     light and camera mounting differ from rollout to rollout (`AppearanceConfig`'s defaults).
     """
 
@@ -66,7 +66,7 @@ class EvaluateConfig:
     eval_seed: int = 1000
     videos: int = 0
     yaw_deg: float = 0.0
-    vary_looks: bool = False
+    vary_appearance: bool = False
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
@@ -202,9 +202,9 @@ class _Worker:
     ) -> Rollout:
         seed = self.config.eval_seed
         placement = episode_placement(self.task, seed, episode, self.config.yaw_deg)
-        if self.config.vary_looks:
+        if self.config.vary_appearance:
             rng = np.random.default_rng([seed, episode, 1])
-            robot, scene = vary_appearance(self.model.spec, self.task.scene, rng)
+            robot, scene = randomise_appearance(self.model.spec, self.task.scene, rng)
             self.backend.close()
             old = self.backend
             self.backend = type(old)(robot, scene, old.image_size, old.rates)

@@ -279,18 +279,18 @@ def _trajectories(
 
     Steps are numbered as they are yielded: an episode's are followed by its demonstration's.
     """
-    shown: list[tuple[Demonstration, int, Array]] = []
+    demonstrations: list[tuple[Demonstration, int, Array]] = []
     n_yielded = 0
     reference = dataset.sources[0].demonstration.steps
     for source in dataset.sources:
         demonstration, actions = source.demonstration, source.demonstration.actions
         _check_same_cameras(source.name, demonstration.steps, reference, cameras)
-        shown.append((demonstration, n_yielded, actions))
+        demonstrations.append((demonstration, n_yielded, actions))
         yield demonstration.steps, np.arange(0), actions
         n_yielded += len(demonstration)
     for i, episode in enumerate(dataset):
         t_star = episode.provenance.t_star
-        demonstration, first, actions = shown[dataset.index[i].source]
+        demonstration, first, actions = demonstrations[dataset.index[i].source]
         if not 0 <= t_star < len(demonstration):
             raise Mismatch(
                 f"episode {i} rejoins at step {t_star} of a demonstration of "

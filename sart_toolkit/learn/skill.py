@@ -38,7 +38,7 @@ from sart_toolkit.poses import Array, check_array, check_pose, frozen
 
 _T = TypeVar("_T")
 
-# A gripper that is told to open and to close knows two; more stand for a finger on a trigger.
+# A gripper commanded to open and close takes two values; more mean an analogue trigger.
 _FEW_GRIPPER_COMMANDS = 4
 
 
@@ -245,10 +245,10 @@ class Skill:
         A regressed target is a little off, the gripper follows it, and the policy follows the
         gripper: what was shown only open or closed would creep shut on the way.
         """
-        shown = self._gripper_commands
-        if len(shown) > _FEW_GRIPPER_COMMANDS:
+        demonstrated = self._gripper_commands
+        if len(demonstrated) > _FEW_GRIPPER_COMMANDS:
             return gripper
-        return float(shown[np.argmin(np.abs(shown - gripper))])
+        return float(demonstrated[np.argmin(np.abs(demonstrated - gripper))])
 
 
 def _checked_image(camera: str, images: Mapping[str, Image]) -> Image:

@@ -477,7 +477,7 @@ def _torch_threads(threads: int | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """A function that tells whether Ctrl-C was pressed; the second one interrupts at once.
+    """A function that returns whether Ctrl-C was pressed; the second one interrupts at once.
 
     Only a step that has finished leaves weights, optimizer and counters that belong together.
     """

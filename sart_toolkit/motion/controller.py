@@ -70,7 +70,7 @@ class ToolController:
         self._q, self._T = q, T
 
     def acknowledge(self, q_sent: Array) -> None:
-        """Go on from the joint targets `(n,)` that the robot was really sent.
+        """Continue from the joint targets `(n,)` that the robot was really sent.
 
         They are the last ones of `move` or `follow`, unless the robot can't go so far in one step.
 

@@ -63,11 +63,11 @@ def straight_line(
         middles = (np.arange(count - 1) + 0.5) / (count - 1)
         between = path.positions(middles)
         # Next to the path's ends a spline is farthest off nearer to these than half way.
-        looked_at = np.concatenate([middles, np.array([0.25, 0.35]) / (count - 1)])
-        looked_at = np.concatenate([looked_at, 1 - looked_at[-2:]])
+        sampled = np.concatenate([middles, np.array([0.25, 0.35]) / (count - 1)])
+        sampled = np.concatenate([sampled, 1 - sampled[-2:]])
         off = max(
             max(distance(model.fk(q), T_at(s)))
-            for q, s in zip(path.positions(looked_at), looked_at, strict=True)
+            for q, s in zip(path.positions(sampled), sampled, strict=True)
         )
         if off <= deviation:
             return timed(model, path, duration, T_at, record_hz)

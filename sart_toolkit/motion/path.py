@@ -96,7 +96,7 @@ class PolylinePath:
 def nearest_on_polyline(points: Array, line: Array) -> Array:
     """The points `(k, d)` of a line through many points `(m, d)` that are nearest to `(k, d)`.
 
-    Only the two pieces at the nearest of the line's points, which SciPy finds, are looked at.
+    Only the two pieces at the nearest of the line's points, which SciPy finds, are considered.
     """
     _, nearest = cKDTree(line).query(points)
     found, least = np.empty_like(points), np.full(len(points), np.inf)

@@ -1,7 +1,7 @@
 """Joint paths round obstacles: RRTConnect, shortcuts, then a smooth spline that is proved clear.
 
 The planner is OMPL's, an extra: `pip install 'sart_toolkit[planning]'`. It is bounded by the edges
-that it may try and never by the clock, so that a path follows from the arguments alone, however
+that it may check and never by the clock, so that a path follows from the arguments alone, however
 busy the machine is.
 """
 
@@ -49,7 +49,7 @@ class PlanConfig:
 
     Joints stay within `window` [rad] of the range between start and goal, and within their limits.
     The trees grow by edges of up to `edge` [rad], each proved to keep `spare` [m] beyond the
-    margin, or half of what start or goal has beyond it where that is less. Of up to `tries` paths
+    margin, or half of what start or goal has beyond it where that is less. Of `attempts` paths
     the shortest is taken, each after `shortcuts` rounds of shortening. After `max_edges` edges no
     further path is looked for. From one recorded step to the next the tool moves no farther than
     `stride` [m] and turns no farther than `stride_deg`, well within a `ToolController`'s lead.
@@ -58,7 +58,7 @@ class PlanConfig:
     window: float = 1.2
     edge: float = 0.3
     spare: float = 0.006
-    tries: int = 3
+    attempts: int = 3
     shortcuts: int = 3
     max_edges: int = 600
     stride: float = 0.016
@@ -261,7 +261,7 @@ def _polylines(
     rng: np.random.Generator,
     config: PlanConfig,
 ) -> list[Array]:
-    """Up to `tries` paths as their corners `(m, n)`, all edges proved clear; none if none is found.
+    """Up to `attempts` paths as corners `(m, n)`, all edges proved clear; none if none is found.
 
     They share `max_edges` among them.
     """
@@ -270,12 +270,12 @@ def _polylines(
         return [straight]
     found: list[Array] = []
     left = config.max_edges
-    for _ in range(config.tries):
+    for _ in range(config.attempts):
         seed = int(rng.integers(1, 2**31))
-        corners, tried = _connected(placed, start, goal, clearance, seed, left, config)
+        corners, checked = _connected(placed, start, goal, clearance, seed, left, config)
         if corners is not None:
             found.append(corners)
-        left -= tried
+        left -= checked
         if left <= 0:
             break
     return found
@@ -290,14 +290,14 @@ def _connected(
     max_edges: int,
     config: PlanConfig,
 ) -> tuple[Array | None, int]:
-    """The corners `(m, n)` of one path from RRTConnect, shortened, and how many edges were tried.
+    """The corners `(m, n)` of one path from RRTConnect, shortened, and how many edges were checked.
 
     It gives up after `max_edges`, without a path.
     """
     from ompl import base, geometric, util
 
     n, model = len(start), placed.kinematics
-    tried = 0
+    checked = 0
 
     def clear(state: Any) -> bool:
         return placed.too_close(np.array(state[0:n]), clearance) is None
@@ -306,8 +306,8 @@ def _connected(
         """Takes an edge if it is proved clear: faster than many checks along it, and safer."""
 
         def checkMotion(self, a: Any, b: Any) -> bool:
-            nonlocal tried
-            tried += 1
+            nonlocal checked
+            checked += 1
             edge = PolylinePath(np.array([a[0:n], b[0:n]]))
             return certify(placed, edge, clearance, _EDGE_CHECKS).verdict == "free"
 
@@ -335,16 +335,16 @@ def _connected(
         planner.setProblemDefinition(problem)
         planner.setRange(config.edge)
         planner.setup()
-        given_up = base.PlannerTerminationCondition(lambda: tried >= max_edges)
+        given_up = base.PlannerTerminationCondition(lambda: checked >= max_edges)
         if planner.solve(given_up).getStatus() != base.PlannerStatus.EXACT_SOLUTION:
-            return None, tried
+            return None, checked
         path = problem.getSolutionPath()
         simplifier = geometric.PathSimplifier(information)
         for _ in range(config.shortcuts):
             simplifier.reduceVertices(path)
             simplifier.partialShortcutPath(path)
         corners = np.array([path.getState(i)[0:n] for i in range(path.getStateCount())])
-    return corners, tried
+    return corners, checked
 
 
 @contextlib.contextmanager
@@ -352,7 +352,7 @@ def _seeded(util: Any, seed: int) -> Iterator[None]:
     """All random numbers of OMPL objects that are made inside follow from the seed; it is quiet.
 
     OMPL complains that a second seed comes too late, which is so for objects made before only:
-    each takes its own seed from one generator when it is made, and that is seeded anew.
+    each takes its own seed from one generator when it is made, and that is seeded again.
     """
     level = util.getLogLevel()
     util.setLogLevel(util.LOG_NONE)

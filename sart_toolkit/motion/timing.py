@@ -1,4 +1,4 @@
-"""Motions in time: a joint path, its scalar law by Ruckig, and the tool's pose along it."""
+"""Motions in time: a joint path, its timing by Ruckig, and the tool's pose along it."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Motion:
     path: SplinePath
     duration: float
     T_at: Callable[[float], Array]
-    _law: Trajectory
+    _timing: Trajectory
 
     def s(self, time: float) -> float:
         """The path parameter in [0, 1] at a time [s]."""
         if time >= self.duration:
             return 1.0
-        position, _, _ = self._law.at_time(max(time, 0.0))
+        position, _, _ = self._timing.at_time(max(time, 0.0))
         return float(np.clip(position[0], 0.0, 1.0))
 
     def T_world_tool(self, time: float) -> Array:
@@ -59,19 +59,19 @@ class Motion:
     def derivatives(self, times: Array) -> tuple[Array, Array, Array]:
         """Joint velocities, accelerations and jerks `(k, n)` at times `(k,)` [s].
 
-        By the chain rule from the derivatives of path and law: q' s', q' s'' + q'' s'^2,
+        By the chain rule from the derivatives of path and timing: q' s', q' s'' + q'' s'^2,
         q' s''' + 3 q'' s' s'' + q''' s'^3.
         """
-        law = [self._law.at_time(float(np.clip(time, 0.0, self.duration))) for time in times]
-        s, v, a = (np.array([row[i][0] for row in law]) for i in range(3))
+        timing = [self._timing.at_time(float(np.clip(time, 0.0, self.duration))) for time in times]
+        s, v, a = (np.array([row[i][0] for row in timing]) for i in range(3))
         j = self._jerks(times)
         q1, q2, q3 = (self.path.spline(np.clip(s, 0.0, 1.0), nu=i) for i in (1, 2, 3))
         v, a, j = v[:, None], a[:, None], j[:, None]
         return q1 * v, q1 * a + q2 * v**2, q1 * j + 3 * q2 * v * a + q3 * v**3
 
     def _jerks(self, times: Array) -> Array:
-        """s''' `(k,)` at times: the law is made of pieces of constant jerk."""
-        profile = self._law.profiles[0][0]
+        """s''' `(k,)` at times: the timing is made of pieces of constant jerk."""
+        profile = self._timing.profiles[0][0]
         pieces = np.asarray(profile.j)
         ends = np.cumsum(profile.t)
         at = np.minimum(np.searchsorted(ends, times, side="right"), len(pieces) - 1)
@@ -113,28 +113,28 @@ def timed(
     if over.max() > 0:
         joint = model.spec.arm_joints[int(np.argmax(over))]
         raise MotionRejected(f"joint limits: the path leaves the range of {joint}; sample nearer")
-    law = _law(path, model.spec, duration)
-    if law is None:
+    timing = _timing(path, model.spec, duration)
+    if timing is None:
         # In recorded steps: the fewest that are enough, and some that aren't.
         enough, few = round(_LONGEST * record_hz), int(duration * record_hz)
-        if few >= enough or _law(path, model.spec, _LONGEST) is None:
+        if few >= enough or _timing(path, model.spec, _LONGEST) is None:
             raise MotionRejected(
                 f"joint limits: the path needs more than {_LONGEST:.0f} s; sample nearer"
             )
         while enough - few > 1:
             middle = (enough + few) // 2
-            if _law(path, model.spec, middle / record_hz) is None:
+            if _timing(path, model.spec, middle / record_hz) is None:
                 few = middle
             else:
                 enough = middle
         duration = enough / record_hz
-        law = _law(path, model.spec, duration)
-        assert law is not None
-    return Motion(path, duration, T_at, law)
+        timing = _timing(path, model.spec, duration)
+        assert timing is not None
+    return Motion(path, duration, T_at, timing)
 
 
-def _law(path: SplinePath, spec: RobotSpec, duration: float) -> Trajectory | None:
-    """The scalar law that just fills `duration`, or None where a joint's limit forbids it."""
+def _timing(path: SplinePath, spec: RobotSpec, duration: float) -> Trajectory | None:
+    """The timing that just fills `duration`, or None where a joint's limit forbids it."""
     ramp = min(_RAMP, duration / 4)
     v = 1.0 / (duration - ramp)
     # A ramp of length r with constant-jerk ends of share e: a = v / (r (1 - e)), j = a / (r e).

@@ -1,4 +1,4 @@
-"""A person's recording, without its window: what each control does, and what the person is told."""
+"""A person's recording, without its window: what each control does, and the messages."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from sart_toolkit.errors import DeviceLost, SartError
 from sart_toolkit.record.devices.manual import Control, ManualDevice
 from sart_toolkit.record.session import End, SessionState, TeleopSession
 
-# More than this [N] is a hard press, which a person should be told of before all else.
+# More than this [N] is a hard press, which a person should be warned of before all else.
 FIRM = 50.0
-# So much [s] may be thrown away without being asked again.
+# So much [s] may be discarded without confirmation.
 _SOON_DONE_AGAIN = 3.0
 
 Tone = Literal["plain", "good", "warning", "bad"]
@@ -31,7 +31,7 @@ class RecordingDesk:
     """Where a person's session, device and controls meet.
 
     Whoever shows it calls `tick` for each control period, `press` for each control, and reads
-    `notice`. Nothing is thrown away or saved short of the goal without being asked a second time.
+    `notice`. Discarding a recording, or saving one that missed the goal, has to be confirmed.
 
     Attributes:
         session: the recording.
@@ -52,7 +52,7 @@ class RecordingDesk:
         Args:
             session: the recording.
             device: what the person steers with, connected.
-            save: writes a demonstration; if it raises a `SartError` it can be tried again.
+            save: writes a demonstration; if it raises a `SartError` saving can be attempted again.
             watch: called with JSON values after each recorded step and each change of state.
         """
         self.session, self.device = session, device
@@ -74,7 +74,7 @@ class RecordingDesk:
             case SessionState.READY:
                 return Notice("This is the start. Press → to record.")
             case SessionState.PAUSED:
-                return Notice("Paused. Press → to go on.")
+                return Notice("Paused. Press → to resume.")
             case SessionState.ENDED:
                 return self._ended_notice()
             case SessionState.SAVED:
@@ -121,7 +121,7 @@ class RecordingDesk:
         except DeviceLost as error:
             # While nothing is recorded it may come back by itself, or at the next →.
             if session.state is SessionState.RECORDING:
-                self._pause(f"Paused: {error}. Plug it in and press → to go on; nothing is lost.")
+                self._pause(f"Paused: {error}. Plug it in and press → to resume; nothing is lost.")
             return
         for control in self.device.controls():
             self.press(control)
@@ -166,7 +166,7 @@ class RecordingDesk:
 
     def _go_on(self) -> None:
         try:
-            # Reading tells whether it answers; what it asks for is not carried out.
+            # Reading shows whether it answers; what it asks for is not carried out.
             self.device.read(self.session.observation)
         except DeviceLost:
             try:
@@ -190,10 +190,10 @@ class RecordingDesk:
             return
         if session.state is SessionState.RECORDING:
             session.pause()
-        goes_on = "→ saves it" if session.state is SessionState.ENDED else "→ goes on"
+        resumes = "→ saves it" if session.state is SessionState.ENDED else "→ resumes"
         self._ask(
             Control.DISCARD,
-            f"Esc again throws {session.seconds:.0f} s of recording away; {goes_on}.",
+            f"Esc again throws {session.seconds:.0f} s of recording away; {resumes}.",
         )
 
     def _ask(self, control: Control, question: str) -> None:
@@ -201,13 +201,13 @@ class RecordingDesk:
 
     def _keep(self) -> None:
         session, device = self.session, self.device
-        shown = session.demonstration(device.operator, device.name, session.seconds_spent)
+        demonstration = session.demonstration(device.operator, device.name, session.seconds_spent)
         try:
-            self._save(shown)
+            self._save(demonstration)
         except SartError as error:
             self._said = Notice(f"Not saved: {error}. → tries again; nothing is lost.", "bad")
             return
-        self.demonstration = shown
+        self.demonstration = demonstration
         session.mark_saved()
 
     def _tell(self) -> None:

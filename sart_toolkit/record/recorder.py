@@ -22,16 +22,16 @@ class StepRecorder:
     """
 
     def __init__(self, backend: Backend, model: RobotModel, cameras: Sequence[str]) -> None:
-        """Record `backend` with the named cameras' pictures.
+        """Record `backend` with the named cameras' images.
 
         Args:
             backend: the robot.
-            model: its kinematics, which tell what each camera is mounted on.
+            model: its kinematics, which say what each camera is mounted on.
             cameras: names of cameras that move with the tool or stand still.
 
         Raises:
             UnknownName: there is no such camera.
-            MissingCapability: the backend takes no pictures.
+            MissingCapability: the backend takes no images.
             InvalidInput: a camera is mounted on a part of the arm before the tool.
         """
         backend.check_cameras(cameras)

@@ -40,7 +40,7 @@ def replay_demonstration(
     model: RobotModel,
     config: SessionConfig | None = None,
 ) -> Demonstration:
-    """What comes of a demonstration's commands on a backend, the object placed as it was.
+    """The result of a demonstration's commands on a backend, the object placed as it was.
 
     Args:
         demonstration: what is replayed.

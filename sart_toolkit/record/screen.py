@@ -125,7 +125,7 @@ class Screen:
                 yield FocusLost()
 
     def clear(self) -> None:
-        """Begin a new picture of the whole window."""
+        """Begin a new image of the whole window."""
         self._canvas.fill(BACKGROUND)
 
     def show(self) -> None:
@@ -208,8 +208,8 @@ class Screen:
         """A filled circle."""
         self._pygame.draw.circle(self._canvas, colour, at, radius)
 
-    def picture(self, box: Box, rgb: Image) -> None:
-        """A picture `(H, W, 3)` uint8, scaled to fit into the middle of a box."""
+    def image(self, box: Box, rgb: Image) -> None:
+        """An image `(H, W, 3)` uint8, scaled to fit into the middle of a box."""
         left, top, width, height = box
         scale = min(width / rgb.shape[1], height / rgb.shape[0])
         left += (width - round(scale * rgb.shape[1])) // 2

@@ -22,8 +22,8 @@ class OperatorStyle:
     `reaction` [s]: time constant with which the hand's velocity follows the intention. `approach`
     [1/s]: speed per distance left, near a goal; `creep` [m/s] is the least. `tremor` [m/s] and
     `tremor_deg` [deg/s]: standard deviation of the hand's slow noise, `tremor_time` [s] its memory.
-    `hesitation` [s]: longest slowing-down between legs; `turn_deg` [deg/s]: greatest turning speed.
-    `rest` [s]: stillness before saying stop.
+    `hesitation` [s]: longest slowing-down between plan steps; `turn_deg` [deg/s]: greatest turning
+    speed. `rest` [s]: stillness before saying stop.
     """
 
     reaction: float = 0.12
@@ -46,7 +46,7 @@ class OperatorStyle:
 
 
 class ScriptedOperator(Device):
-    """Steers through the legs of a task's plan by what it sees, like a person at a 3D mouse."""
+    """Follows the steps of a task's plan by what it sees, like a person at a 3D mouse."""
 
     name = "scripted"
     operator = "scripted operator"

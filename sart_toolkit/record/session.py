@@ -122,7 +122,7 @@ class SessionConfig:
 
 
 class SessionState(enum.Enum):
-    """What a session is at; the value is the word that a person reads."""
+    """The state of a session; the value is the word that a person reads."""
 
     READY = "ready"
     RECORDING = "recording"
@@ -145,18 +145,18 @@ class TeleopSession:
     It draws nothing, and only the backend makes it wait: each `advance` is one control period.
     While it isn't recording a simulation stands still.
 
-    A backend that can't be reset is recorded from wherever the robot is, and its placement is what
-    it is told. One that lacks what the task's success is judged by records no success; a person may
+    A backend that can't be reset is recorded from wherever the robot is, and its placement is the
+    one given. One that lacks what the task's success is judged by records no success; a person may
     say that the goal was reached, see `say_reached`.
 
     Attributes:
         state: what it is at.
-        judged_by: who tells whether the goal is reached: the task, a person, or nobody yet.
+        judged_by: who decides whether the goal is reached: the task, a person, or nobody yet.
         end: why it ended, once it has.
         gripper: the gripper command in force, in [0, 1].
         trouble: why the last command was not carried out; empty where it was.
-        contacts: what the robot, or what it carries, touched in the last control period, but for
-            what it carries itself; the firmest first.
+        contacts: what the robot, or what it grasps, touched in the last control period, but for
+            what it grasps itself; the firmest first.
     """
 
     def __init__(
@@ -176,11 +176,11 @@ class TeleopSession:
             model: the robot's kinematics.
             placement: where the object stands; in the middle of its range if left out.
             config: cameras and limits.
-            clock: tells the wall-clock time [s].
+            clock: returns the wall-clock time [s].
 
         Raises:
             UnknownName: there is no such camera.
-            MissingCapability: the backend takes no pictures.
+            MissingCapability: the backend takes no images.
         """
         self.backend, self.task, self.model = backend, task, model
         self.placement = placement or Placement()
@@ -232,7 +232,7 @@ class TeleopSession:
 
     @property
     def recorded(self) -> Observation:
-        """What was recorded last, with the pictures of the session's cameras."""
+        """What was recorded last, with the images of the session's cameras."""
         return self._recorder.observations[-1]
 
     @property
@@ -274,7 +274,7 @@ class TeleopSession:
         if self._judges:
             return self.task.failure_reason(self._now)
         lacking = ", ".join(missing_abilities(self.backend, self.task.observes))
-        return f"backend {self.backend.name!r} can't tell, for want of {lacking}"
+        return f"backend {self.backend.name!r} can't tell, since it lacks {lacking}"
 
     @property
     def _record_hz(self) -> int:
@@ -283,10 +283,10 @@ class TeleopSession:
     # --- what a person does ---------------------------------------------------------------------
 
     def start(self) -> None:
-        """Begin to record, or go on after a pause.
+        """Begin to record, or resume after a pause.
 
         Raises:
-            InvalidInput: there is nothing to start or go on with.
+            InvalidInput: there is nothing to start or resume.
         """
         self._expect("start", SessionState.READY, SessionState.PAUSED)
         if self._started_at is None:
@@ -340,7 +340,7 @@ class TeleopSession:
         self._expect("say_reached", SessionState.ENDED)
         if self._judges:
             raise InvalidInput(
-                "say_reached: this backend tells by itself whether the goal is reached"
+                "say_reached: this backend itself decides whether the goal is reached"
             )
         held = min(len(self._success), max(1, round(self.task.hold * self._record_hz)))
         self._success[-held:] = [True] * held
@@ -437,11 +437,11 @@ class TeleopSession:
             return f"joint limit: {self.model.spec.arm_joints[joint]}"
         return "joints would jump" if isinstance(error, MotionRejected) else "out of reach"
 
-    def _outer(self, felt: list[Contact]) -> list[Contact]:
-        scene, pairs = self.task.scene, {(contact.a, contact.b) for contact in felt}
+    def _outer(self, contacts: list[Contact]) -> list[Contact]:
+        scene, pairs = self.task.scene, {(contact.a, contact.b) for contact in contacts}
         grasped = scene.grasped(pairs, self.model.spec.gripper.finger_links)
         outer = scene.outer_contacts(pairs, grasped)
-        return sorted((c for c in felt if (c.a, c.b) in outer), key=lambda c: -c.force)
+        return sorted((c for c in contacts if (c.a, c.b) in outer), key=lambda c: -c.force)
 
     # --- the result -----------------------------------------------------------------------------
 
@@ -522,7 +522,7 @@ def record_demonstration(
     Raises:
         InvalidInput: the device did not stop within `max_seconds`.
         UnknownName: there is no such camera.
-        MissingCapability: the backend takes no pictures.
+        MissingCapability: the backend takes no images.
     """
     session = TeleopSession(backend, task, model, placement, config)
     session.start()

@@ -40,7 +40,7 @@ _TONES: dict[Tone, str] = {"plain": LINE, "good": GREEN, "warning": ORANGE, "bad
 _MEANINGS = {
     SessionState.READY: ("start", "start again", "close"),
     SessionState.RECORDING: ("end", "start again", "discard"),
-    SessionState.PAUSED: ("go on", "start again", "discard"),
+    SessionState.PAUSED: ("resume", "start again", "discard"),
     SessionState.ENDED: ("save", "record again", "discard"),
     SessionState.SAVED: ("close", "", ""),
 }
@@ -52,10 +52,10 @@ _SAVED_SHOWN = 2.0
 
 
 class Pace:
-    """Tells when control periods are due, so that simulated and real time go by alike.
+    """Says when control periods are due, so that simulated and real time go by alike.
 
     A machine that falls behind catches up; what it can't make good within a quarter of a second it
-    lets go, and `share` tells. No period is ever left out.
+    lets go, and `share` says by how much. No period is ever left out.
 
     Attributes:
         share: simulated over real time, over the last second.
@@ -148,7 +148,7 @@ class RecordingWindow:
     def draw(self) -> None:
         """Draw the window once."""
         self._screen.clear()
-        self._screen.picture(_SCENE, self._scene_picture())
+        self._screen.image(_SCENE, self._scene_image())
         self._head()
         self._wrist_and_settings()
         self._notice()
@@ -156,7 +156,7 @@ class RecordingWindow:
         self._keys()
         self._screen.show()
 
-    def _scene_picture(self) -> Image:
+    def _scene_image(self) -> Image:
         """The scene as it is: small and often while it moves, sharp once it stands still."""
         session = self._desk.session
         state = (id(session.recorded), session.seconds)
@@ -194,7 +194,7 @@ class RecordingWindow:
         screen, desk = self._screen, self._desk
         session, device = desk.session, desk.device
         camera = session.config.cameras[0]
-        screen.picture((800, 140, 280, 280), session.recorded.cameras[camera].rgb)
+        screen.image((800, 140, 280, 280), session.recorded.cameras[camera].rgb)
         screen.box((806, 394, 20 + 8 * len(camera), 20), BACKGROUND, radius=4)
         screen.text((812, 395), camera, 13, FAINT)
         left = 1096
@@ -215,8 +215,8 @@ class RecordingWindow:
         screen.text((left, 344), "Gripper (Space)", 14, FAINT)
         screen.bar((left, 370, 168, 10), session.observation.gripper, BLUE)
         # While nothing moves, what the hand has asked for in the meantime.
-        told = "open" if device.gripper < 0.5 else "closed"
-        screen.text((left, 388), f"told: {told}", 15)
+        commanded = "open" if device.gripper < 0.5 else "closed"
+        screen.text((left, 388), f"commanded: {commanded}", 15)
 
     def _notice(self) -> None:
         notice = self._desk.notice

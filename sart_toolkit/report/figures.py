@@ -1,4 +1,4 @@
-"""Pictures of a run, each as the bytes of one PNG: film strip, spheres and paths, curves.
+"""Images of a run, each as the bytes of one PNG: film strip, spheres and paths, curves.
 
 They are drawn on matplotlib's Agg canvas, without pyplot, in a light or a dark theme.
 """
@@ -42,7 +42,7 @@ _ACCENT = {"light": "#0063b1", "dark": "#6cb6ff"}
 
 
 def sphere_colour(index: int) -> str:
-    """The colour, as `#rrggbb`, of a sphere in every picture and table."""
+    """The colour, as `#rrggbb`, of a sphere in every image and table."""
     return SPHERE_COLOURS[index % len(SPHERE_COLOURS)]
 
 
@@ -52,13 +52,13 @@ def sphere_colour(index: int) -> str:
 def film_strip(
     demonstration: Demonstration, camera: str = "wrist", n: int = 8, size: int = 240
 ) -> bytes:
-    """PNG bytes of n camera pictures side by side, evenly over the demonstration, with their times.
+    """PNG bytes of n camera images side by side, evenly over the demonstration, with their times.
 
     Args:
-        demonstration: where the pictures come from; its first and last step are always among them.
-        camera: whose pictures.
+        demonstration: where the images come from; its first and last step are always among them.
+        camera: whose images.
         n: how many, at least 2; at most one a step is drawn.
-        size: height of each picture [pixel].
+        size: height of each image [pixel].
 
     Raises:
         UnknownName: the demonstration has no such camera.
@@ -68,7 +68,7 @@ def film_strip(
     if camera not in cameras:
         raise unknown_name("camera", camera, cameras)
     if n < 2:
-        raise InvalidInput(f"n: expected at least 2 pictures, got {n}")
+        raise InvalidInput(f"n: expected at least 2 images, got {n}")
     if size < 32:
         raise InvalidInput(f"size: expected at least 32 pixels, got {size}")
     rgb = cameras[camera].rgb
@@ -80,9 +80,9 @@ def film_strip(
     draw, text = ImageDraw.Draw(strip), font(max(9, round(0.6 * footer)))
     start = demonstration.timestamps[0]
     for i, t in enumerate(chosen):
-        picture = PillowImage.fromarray(rgb[t])
+        image = PillowImage.fromarray(rgb[t])
         left = gap + i * (width + gap)
-        strip.paste(picture.resize((width, size), PillowImage.Resampling.LANCZOS), (left, gap))
+        strip.paste(image.resize((width, size), PillowImage.Resampling.LANCZOS), (left, gap))
         label = f"{demonstration.timestamps[t] - start:.1f} s"
         at = (left + width / 2, gap + size + footer / 2)
         draw.text(at, label, fill="#f2f4f7", font=text, anchor="mm")
@@ -125,7 +125,7 @@ def segment_paths(episodes: Iterable[Episode], which: Paths = "measured") -> lis
     return paths
 
 
-def scene_picture(
+def scene_image(
     demonstration: Demonstration,
     annotation: Annotation | None = None,
     paths: Sequence[SegmentPath] = (),
@@ -149,8 +149,8 @@ def scene_picture(
                 f"paths: one belongs to sphere {path.sphere}, the annotation has {len(spheres)};"
                 " pass the annotation that the segments were made from"
             )
-    shown = demonstration.steps.measured_Ts_world_tool[:, :3, 3]
-    views = _choose_views(shown, spheres, paths)
+    demonstrated = demonstration.steps.measured_Ts_world_tool[:, :3, 3]
+    views = _choose_views(demonstrated, spheres, paths)
     with _figure((11.0, 5.6), theme) as figure:
         for column, view in enumerate(views):
             axes: Any = figure.add_axes((0.5 * column, 0.0, 0.5, 1.0), projection="3d")
@@ -159,7 +159,7 @@ def scene_picture(
             for i in view.spheres:
                 _draw_sphere(axes, spheres[i].T_world_key[:3, 3], spheres[i].radius, i, toward)
                 _draw_paths(axes, [p.positions for p in paths if p.sphere == i], i)
-            _draw_demonstration(axes, shown, theme)
+            _draw_demonstration(axes, demonstrated, theme)
         _finish_views(figure, views, _legend_rows(spheres, paths, theme))
         return _png(figure, tight=True)
 
@@ -177,11 +177,11 @@ class _View:
 
 
 def _choose_views(
-    shown: Array, spheres: Sequence[PrecisionSphere], paths: Sequence[SegmentPath]
+    demonstrated: Array, spheres: Sequence[PrecisionSphere], paths: Sequence[SegmentPath]
 ) -> tuple[_View, _View]:
     """The whole from the side, and either the spheres too small to see there or the whole again."""
     everyone = range(len(spheres))
-    whole = _box(shown, spheres, [path.positions for path in paths])
+    whole = _box(demonstrated, spheres, [path.positions for path in paths])
     side = _View("from the side", 16.0, -60.0, *whole, everyone)
     small = [i for i in everyone if spheres[i].radius < 0.1 * float(whole[1].max())]
     if small:
@@ -193,11 +193,11 @@ def _choose_views(
 
 
 def _box(
-    shown: Array, spheres: Sequence[PrecisionSphere], paths: Sequence[Array]
+    demonstrated: Array, spheres: Sequence[PrecisionSphere], paths: Sequence[Array]
 ) -> tuple[Array, Array]:
     centres = np.array([s.T_world_key[:3, 3] for s in spheres]).reshape(-1, 3)
     radii = np.array([s.radius for s in spheres]).reshape(-1, 1)
-    everything = np.concatenate([shown, centres - radii, centres + radii, *paths])
+    everything = np.concatenate([demonstrated, centres - radii, centres + radii, *paths])
     low, high = everything.min(axis=0), everything.max(axis=0)
     # A flat box can't be drawn: give each side at least a tenth of the longest.
     least = max(0.1 * float((high - low).max()), 1e-3)
@@ -258,12 +258,12 @@ def _draw_paths(axes: Any, segments: list[Array], index: int) -> None:
     axes.plot(*starts.T, "o", color=colour, markersize=3, markeredgewidth=0)
 
 
-def _draw_demonstration(axes: Any, shown: Array, theme: Theme) -> None:
+def _draw_demonstration(axes: Any, demonstrated: Array, theme: Theme) -> None:
     ink = _INK[theme]
     ends = {"color": ink, "mec": ink, "mew": 1.8, "zorder": 11, "axlim_clip": True}
-    axes.plot(*shown.T, color=ink, linewidth=2.2, zorder=10, axlim_clip=True)
-    axes.plot(*shown[:1].T, "o", markersize=8, **{**ends, "color": _PAPER[theme]})
-    axes.plot(*shown[-1:].T, "s", markersize=6, **ends)
+    axes.plot(*demonstrated.T, color=ink, linewidth=2.2, zorder=10, axlim_clip=True)
+    axes.plot(*demonstrated[:1].T, "o", markersize=8, **{**ends, "color": _PAPER[theme]})
+    axes.plot(*demonstrated[-1:].T, "s", markersize=6, **ends)
 
 
 def _legend_rows(
@@ -345,7 +345,7 @@ def training_curve(
         return _png(figure)
 
 
-def placement_picture(
+def placement_image(
     placements: Sequence[Mapping[str, Mapping[str, float]]],
     outcomes: Sequence[Outcome],
     demonstrated: Mapping[str, Mapping[str, float]] | None = None,
@@ -473,6 +473,6 @@ def _png(figure: Figure, tight: bool = False) -> bytes:
     )
     # Without the alpha channel, which is full everywhere, a quarter smaller.
     stream = io.BytesIO()
-    with PillowImage.open(drawn) as picture:
-        picture.convert("RGB").save(stream, "png", optimize=True)
+    with PillowImage.open(drawn) as image:
+        image.convert("RGB").save(stream, "png", optimize=True)
     return stream.getvalue()

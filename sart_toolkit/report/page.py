@@ -29,21 +29,21 @@ from sart_toolkit.report.figures import (
     SegmentPath,
     Theme,
     film_strip,
-    placement_picture,
-    scene_picture,
+    placement_image,
+    scene_image,
     segment_paths,
     sphere_colour,
     training_curve,
 )
 
 MAX_VIDEO_BYTES = 48 * 2**20
-_FILM_PICTURES = 8
+_FILM_IMAGES = 8
 
 Shown = dict[str, Any]
 
 
 def write_report(run_dir: Path, out: Path) -> None:
-    """Write the page about a run to `out`: pictures and videos inside, no request to anywhere.
+    """Write the page about a run to `out`: images and videos inside, no request to anywhere.
 
     A part that the run doesn't have yet is left out with a line that says so; a part that is
     there but damaged is an error.
@@ -129,7 +129,7 @@ def _field(value: Any, file: str, *keys: str) -> Any:
     return value
 
 
-# --- pictures and numbers -----------------------------------------------------------------------
+# --- images and numbers -----------------------------------------------------------------------
 
 
 def _data_uri(kind: str, content: bytes) -> str:
@@ -293,11 +293,11 @@ def _demonstration(run: _Run) -> Shown | str:
         return "No demo.h5 in this run: nothing was recorded yet."
     d = run.demonstration
     if not d.steps.cameras:
-        return "The demonstration holds no camera pictures."
+        return "The demonstration holds no camera images."
     camera = "wrist" if "wrist" in d.steps.cameras else sorted(d.steps.cameras)[0]
-    n = min(_FILM_PICTURES, len(d))
+    n = min(_FILM_IMAGES, len(d))
     end = duration(float(d.timestamps[-1] - d.timestamps[0]))
-    alt = f"{n} pictures of the {camera} camera, evenly from the start to the end after {end}"
+    alt = f"{n} images of the {camera} camera, evenly from the start to the end after {end}"
     return {"camera": camera, "film": _image(film_strip(d, camera, n), alt)}
 
 
@@ -309,7 +309,7 @@ def _spheres(run: _Run) -> Shown | str:
     annotation.check_matches(demonstration)
 
     def draw(theme: Theme) -> bytes:
-        return scene_picture(demonstration, annotation, paths, theme)
+        return scene_image(demonstration, annotation, paths, theme)
 
     counts = collections.Counter(path.sphere for path in paths)
     times = demonstration.timestamps - demonstration.timestamps[0]
@@ -425,7 +425,7 @@ def _placements(run: _Run, episodes: Sequence[Mapping[str, Any]]) -> Shown | Non
     demonstrated = {names.pop(): shown} if shown and len(names) == 1 else None
 
     def draw(theme: Theme) -> bytes:
-        return placement_picture(places, outcomes, demonstrated, theme)
+        return placement_image(places, outcomes, demonstrated, theme)
 
     good = outcomes.count("success")
     bad = len(places) - good

@@ -1,4 +1,4 @@
-"""What was recorded, to look at again: pictures and facts by waypoint, as a film or in a window."""
+"""What was recorded, to look at again: images and facts by waypoint, as a film or in a window."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from sart_toolkit.scenes.spec import SceneState
 
 FILM_SIZE = 480
 _WINDOW_SIZE = 448
-# Pictures of the scene kept in the window, so that stepping to and fro is quick.
+# Images of the scene kept in the window, so that stepping to and fro is quick.
 _KEPT = 120
 
 
@@ -42,9 +42,9 @@ class Playback:
 
     Attributes:
         title: what is played.
-        demonstration: what was shown, or what the episode was made from.
+        demonstration: the recorded one, or what the episode was made from.
         split: how many waypoints come from the episode; 0 for a demonstration.
-        camera: the recorded camera whose pictures are shown; another of them may be set.
+        camera: the recorded camera whose images are shown; another of them may be set.
     """
 
     def __init__(
@@ -57,11 +57,11 @@ class Playback:
 
         Args:
             title: what it is called.
-            demonstration: what was shown.
+            demonstration: the recorded demonstration.
             episode: its segment is played first, then the demonstration from `t_star`.
 
         Raises:
-            InvalidInput: no pictures were recorded.
+            InvalidInput: no images were recorded.
         """
         self.title, self.demonstration = title, demonstration
         self._parts = [(demonstration.steps, t) for t in range(len(demonstration))]
@@ -73,7 +73,7 @@ class Playback:
         self._first = 0 if episode is None else episode.provenance.t_star
         cameras = list(demonstration.steps.cameras)
         if not cameras:
-            raise InvalidInput(f"{title}: holds no pictures; record it with a camera")
+            raise InvalidInput(f"{title}: holds no images; record it with a camera")
         self.camera = cameras[0]
 
     def __len__(self) -> int:
@@ -93,7 +93,7 @@ class Playback:
         """The demonstration's waypoint at step `i`; in a segment, the one it joins."""
         return self._first + max(0, i - self.split)
 
-    def picture(self, i: int) -> Image:
+    def image(self, i: int) -> Image:
         """What the recorded camera saw at step `i`, `(H, W, 3)` uint8."""
         steps, t = self._parts[i]
         return steps.cameras[self.camera].rgb[t]
@@ -126,7 +126,7 @@ class SceneView:
     """Draws the scene from outside as it was at each step, from recorded joints and bodies.
 
     Through an episode's segment the bodies are where the demonstration had them at the waypoint
-    that it joins, and what is carried moves with the tool.
+    that it joins, and what is grasped moves with the tool.
     """
 
     def __init__(self, playback: Playback, backend: Backend, camera: str) -> None:
@@ -154,16 +154,16 @@ class SceneView:
         self._playback, self._scene, self._camera = playback, backend.scene, backend.cameras[camera]
         self._phases = demonstration_phases(playback.demonstration, backend.robot, backend.scene)
 
-    def picture(self, i: int, size: int) -> Image:
+    def image(self, i: int, size: int) -> Image:
         """The scene at step `i`, `(size, size, 3)` uint8."""
         return self._stage.draw(self._state(i), self._camera, size, size).rgb
 
     def _state(self, i: int) -> SceneState:
         playback, scene = self._playback, self._scene
-        shown, t = playback.demonstration, playback.waypoint(i)
-        Ts = {body.name: shown.body_Ts_world[body.name][t] for body in scene.bodies}
+        demonstration, t = playback.demonstration, playback.waypoint(i)
+        Ts = {body.name: demonstration.body_Ts_world[body.name][t] for body in scene.bodies}
         q, T_world_tool = playback.joints(i)
-        T_moved = T_world_tool @ inverse(shown.steps.measured_Ts_world_tool[t])
+        T_moved = T_world_tool @ inverse(demonstration.steps.measured_Ts_world_tool[t])
         for name in self._phases[t].grasped:
             Ts[name] = T_moved @ Ts[name]
         return scene.seen_state(q, playback.gripper(i)[0], Ts)
@@ -177,22 +177,22 @@ def film(playback: Playback, scene: SceneView | None) -> Iterator[Image]:
         scene: draws it from outside, the wrist view inset; without it the wrist view alone.
     """
     for i in range(len(playback)):
-        picture = playback.picture(i)
-        frame = picture if scene is None else inset(scene.picture(i, FILM_SIZE), picture)
+        image = playback.image(i)
+        frame = image if scene is None else inset(scene.image(i, FILM_SIZE), image)
         yield strip(_large(frame), _facts(playback, i), i / playback.hz)
 
 
 def _large(frame: Image) -> Image:
-    """A small picture made large enough to write under, each pixel a square."""
+    """A small image made large enough to write under, each pixel a square."""
     times = max(1, round(FILM_SIZE / frame.shape[0]))
     return np.repeat(np.repeat(frame, times, axis=0), times, axis=1)
 
 
 def _facts(playback: Playback, i: int) -> str:
     force = playback.force(i)
-    felt = "" if np.isnan(force) else f" · {force:.0f} N"
+    force_text = "" if np.isnan(force) else f" · {force:.0f} N"
     reached = " · goal reached" if playback.success(i) else ""
-    return f"{playback.part(i)} · gripper {playback.gripper(i)[0]:.2f}{felt}{reached}"
+    return f"{playback.part(i)} · gripper {playback.gripper(i)[0]:.2f}{force_text}{reached}"
 
 
 class PlayWindow:
@@ -218,7 +218,7 @@ class PlayWindow:
             scene: draws it from outside; without it the wrist view is shown large.
             screen: where it is drawn.
             speed: times real time.
-            clock: tells the time [s].
+            clock: returns the time [s].
 
         Raises:
             InvalidInput: the speed is not positive.
@@ -233,7 +233,7 @@ class PlayWindow:
     def run(self) -> None:
         """Play until the window is closed."""
         due = self._clock()
-        shown = None
+        drawn = None
         while not self.closed:
             for event in self._screen.events():
                 if isinstance(event, Closed):
@@ -245,9 +245,9 @@ class PlayWindow:
                 self.step(1)
                 # Where drawing takes longer than a step, no step is left out.
                 due = max(due + self._period, self._clock())
-            if shown != (self.at, self.playing):
+            if drawn != (self.at, self.playing):
                 self.draw()
-                shown = (self.at, self.playing)
+                drawn = (self.at, self.playing)
             else:
                 time.sleep(0.005)
 
@@ -269,18 +269,18 @@ class PlayWindow:
                 self.closed = True
 
     def step(self, by: int) -> None:
-        """Go on, or back, by a number of steps, as far as there are any."""
+        """Go forward, or back, by a number of steps, as far as there are any."""
         last = len(self._playback) - 1
         self.at = min(max(self.at + by, 0), last)
         if self.playing and self.at == last:
             self.playing = False
 
-    def _scene_picture(self) -> Image:
+    def _scene_image(self) -> Image:
         i = self.at
         if self._scene is None:
-            return self._playback.picture(i)
+            return self._playback.image(i)
         if i not in self._kept:
-            self._kept[i] = self._scene.picture(i, _WINDOW_SIZE)
+            self._kept[i] = self._scene.image(i, _WINDOW_SIZE)
             if len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return self._kept[i]
@@ -289,16 +289,19 @@ class PlayWindow:
         """Draw the window once."""
         screen, playback, i = self._screen, self._playback, self.at
         screen.clear()
-        screen.picture((16, 16, 720, 720), self._scene_picture())
+        screen.image((16, 16, 720, 720), self._scene_image())
         screen.text((752, 14), playback.title, 22, BRIGHT, bold=True)
-        shown = playback.demonstration
+        demonstration = playback.demonstration
         screen.text(
-            (752, 48), f"{shown.task}  ·  {shown.backend}  ·  by {shown.operator}", 14, FAINT
+            (752, 48),
+            f"{demonstration.task}  ·  {demonstration.backend}  ·  by {demonstration.operator}",
+            14,
+            FAINT,
         )
         screen.box((752, 76, 512, 52), CARD, edge=BLUE if self.playing else LINE)
         screen.text((768, 89), "playing" if self.playing else "stopped", 22, BRIGHT, bold=True)
         screen.text((1250, 87), f"{i / playback.hz:.1f} s", 24, BRIGHT, align="right")
-        screen.picture((752, 140, 320, 320), playback.picture(i))
+        screen.image((752, 140, 320, 320), playback.image(i))
         screen.box((758, 434, 20 + 8 * len(playback.camera), 20), BACKGROUND, radius=4)
         screen.text((764, 435), playback.camera, 13, FAINT)
         measured, commanded = playback.gripper(i)
@@ -306,7 +309,7 @@ class PlayWindow:
         self._fact(140, "Step", f"{i + 1} of {len(playback)}")
         self._fact(196, "From the", playback.part(i))
         self._fact(252, "Waypoint", str(playback.waypoint(i)) if i >= playback.split else "–")
-        self._fact(308, "Gripper, told", f"{measured:.2f}, {commanded:.2f}")
+        self._fact(308, "Gripper, commanded", f"{measured:.2f}, {commanded:.2f}")
         words = "not measured" if np.isnan(force) else f"{force:.0f} N"
         self._fact(364, "Contact force", words, ORANGE if force > 0 else TEXT)
         reached = playback.success(i)

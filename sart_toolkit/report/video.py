@@ -44,7 +44,7 @@ def write_video(path: Path, frames: Iterable[Image], fps: float, crf: int = 23) 
 
     Args:
         path: the file; a suffix other than `.mp4` is refused.
-        frames: uint8 `(H, W, 3)` pictures of one size, at least one; an iterator is consumed as
+        frames: uint8 `(H, W, 3)` images of one size, at least one; an iterator is consumed as
             it encodes, so frames need not fit in memory.
         fps: frames per second.
         crf: x264's constant rate factor, 0 (lossless) to 51.
@@ -63,11 +63,11 @@ def write_video(path: Path, frames: Iterable[Image], fps: float, crf: int = 23) 
     remaining = iter(frames)
     first = next(remaining, None)
     if first is None:
-        raise InvalidInput(f"{path}: no frames to write; pass at least one picture")
+        raise InvalidInput(f"{path}: no frames to write; pass at least one image")
     check_frame("frame 0", first)
     with replacing(path) as temporary:
-        pictures = itertools.chain([first], remaining)
-        return _encode(temporary, pictures, np.shape(first), fps, crf, path)
+        images = itertools.chain([first], remaining)
+        return _encode(temporary, images, np.shape(first), fps, crf, path)
 
 
 def check_frame(name: str, frame: Image) -> Image:
@@ -139,12 +139,12 @@ def _feed(process: subprocess.Popen[bytes], frames: Iterator[Image], shape: tupl
     # A broken pipe means that ffmpeg has given up: its exit status and log say why.
     with contextlib.suppress(BrokenPipeError), pipe:
         for frame in frames:
-            picture = check_frame(f"frame {n}", frame)
-            if picture.shape != shape:
+            image = check_frame(f"frame {n}", frame)
+            if image.shape != shape:
                 raise InvalidInput(
-                    f"frame {n}: expected the first frame's shape {shape}, got {picture.shape}"
+                    f"frame {n}: expected the first frame's shape {shape}, got {image.shape}"
                 )
-            pipe.write(np.ascontiguousarray(_even(picture)).data)
+            pipe.write(np.ascontiguousarray(_even(image)).data)
             n += 1
     return n
 
@@ -162,7 +162,7 @@ def _ffmpeg() -> str:
 def film_rollout(
     path: Path, moments: Iterable[Moment], hz: float, episode: int, outcome: Outcome
 ) -> None:
-    """Write a rollout's video: seen from outside, the wrist picture inset, a caption below.
+    """Write a rollout's video: seen from outside, the wrist image inset, a caption below.
 
     Args:
         path: the mp4 file.
@@ -206,11 +206,11 @@ def inset(
     fraction: float = 0.34,
     corner: Corner = "top right",
 ) -> Image:
-    """A copy of `frame` with the wrist picture, bordered and labelled, in one of its corners.
+    """A copy of `frame` with the wrist image, bordered and labelled, in one of its corners.
 
     Args:
         frame: the overview, uint8 `(H, W, 3)`.
-        wrist: the wrist camera's picture, uint8 `(h, w, 3)`; resized to keep its proportions.
+        wrist: the wrist camera's image, uint8 `(h, w, 3)`; resized to keep its proportions.
         label: written over the inset's lower edge; empty for none.
         fraction: the inset's greatest width and height as a part of the frame's, in (0, 1).
         corner: where it goes.
@@ -238,8 +238,8 @@ def inset(
     draw.rectangle(
         (left - border, top - border, right + border - 1, bottom + border - 1), fill="white"
     )
-    picture = PillowImage.fromarray(np.ascontiguousarray(wrist))
-    canvas.paste(picture.resize(size, PillowImage.Resampling.BICUBIC), (left, top))
+    image = PillowImage.fromarray(np.ascontiguousarray(wrist))
+    canvas.paste(image.resize(size, PillowImage.Resampling.BICUBIC), (left, top))
     text = font(max(8, round(0.03 * height)))
     box = text.getbbox(label)
     if label and box[2] + 8 <= size[0]:

@@ -120,7 +120,7 @@ class CameraSpec:
     """An RGB-D camera on a frame of the robot, or in the world where `frame` is "world".
 
     `T_frame_camera`: camera frame z forward, x right, y down. `fov_y_deg`: vertical field of view;
-    pictures are square-pixel, the horizontal field follows from the picture's shape.
+    images are square-pixel, the horizontal field follows from the image's shape.
     """
 
     name: str
@@ -149,7 +149,7 @@ ImageSize = int | str | tuple[int, int]
 
 
 def check_image_size(value: ImageSize) -> tuple[int, int]:
-    """A picture's width and height [pixels].
+    """An image's width and height [pixels].
 
     Args:
         value: (width, height), text such as "160x120", or one number for a square.
@@ -207,7 +207,7 @@ class GripperSpec:
     `closed_position` ([rad], or [m] where it slides); `followers` maps each linked joint to its
     ratio to the driver. `finger_links` are the links that may touch what is grasped. `force`
     ([N m] or [N]) and `speed` ([rad/s] or [m/s]) bound the driver. `armature` ([kg m²] or [kg]) is
-    the drive's inertia as felt at each joint, through its gears: links of a few grams alone would
+    the drive's inertia reflected to each joint through its gears: links of a few grams alone would
     hold a heavy object badly in any simulator.
     """
 
@@ -236,7 +236,7 @@ class RobotSpec:
     `home` [rad], `velocity_limits` [rad/s], `acceleration_limits` [rad/s²], `jerk_limits`
     [rad/s³] (a URDF has no such entries). `T_gripper_tool`: the tool frame in the gripper's base,
     z pointing out between the fingertips, x along the direction in which they close. `cameras` are
-    mounted on its frames; the one that policies see by is called "wrist" unless told otherwise.
+    mounted on its frames; policies use the one called "wrist" unless specified otherwise.
     """
 
     name: str

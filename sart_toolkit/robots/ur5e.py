@@ -1,4 +1,4 @@
-"""Universal Robots UR5e with a wrist RGB-D camera, and whichever gripper it carries."""
+"""Universal Robots UR5e with a wrist RGB-D camera, and the gripper given."""
 
 from __future__ import annotations
 

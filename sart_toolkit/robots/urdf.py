@@ -196,7 +196,7 @@ def _elements(source: Path, prefix: str) -> list[ET.Element]:
         for tag in ("parent", "child"):
             for child in element.findall(tag):
                 child.set("link", prefix + child.get("link", ""))
-        # The linkage is told by the robot's GripperSpec; readers treat mimic differently.
+        # The robot's GripperSpec describes the linkage; readers treat mimic differently.
         for mimic in element.findall("mimic"):
             element.remove(mimic)
     return kept
@@ -279,9 +279,9 @@ def _simplified(
     joined = mesh.copy()
     joined.merge_vertices(digits_vertex=3)
     joined.update_faces(joined.nondegenerate_faces())
-    tries = [_decimated(m, target) for m in (mesh, solid, joined) if m is not None]
-    good = [m for m in tries if len(m.faces) <= 2 * target]
-    return good[0] if good else min(tries, key=lambda m: len(m.faces))
+    candidates = [_decimated(m, target) for m in (mesh, solid, joined) if m is not None]
+    good = [m for m in candidates if len(m.faces) <= 2 * target]
+    return good[0] if good else min(candidates, key=lambda m: len(m.faces))
 
 
 def _decimated(mesh: trimesh.Trimesh, target: int) -> trimesh.Trimesh:

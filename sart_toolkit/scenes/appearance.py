@@ -1,4 +1,4 @@
-"""Other colours, light and camera mountings for the same scene, to try or train a policy on."""
+"""Other colours, light and camera mountings for a scene, to train or evaluate a policy on."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sart_toolkit.scenes.spec import Body, SceneSpec
 
 @dataclass(frozen=True)
 class AppearanceConfig:
-    """How far looks vary; every value is the half width of a uniform law.
+    """How far the appearance varies; each value is the half-width of a uniform distribution.
 
     `colour`: of each channel of a shape's colour, in [0, 1]; `light`, `ambient`: relative, of the
     light's intensity and of what it leaves in shadow; `light_deg`: of the light's direction;
@@ -37,13 +37,13 @@ class AppearanceConfig:
                 raise InvalidInput(f"{field.name}: expected a finite number >= 0, got {value}")
 
 
-def vary_appearance(
+def randomise_appearance(
     robot: RobotSpec,
     scene: SceneSpec,
     rng: np.random.Generator,
     config: AppearanceConfig | None = None,
 ) -> tuple[RobotSpec, SceneSpec]:
-    """The same robot and scene with looks drawn at random: what moves, and how, stays the same.
+    """The same robot and scene with a random appearance: what moves, and how, stays the same.
 
     Colours of the scene's bodies, the light, and the wrist camera's pose vary; robot and held
     bodies keep their colours. Saved states of the one scene can be restored in the other.

@@ -28,7 +28,7 @@ _POSE_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Detent:
-    """A catch that a joint snaps into at `position`, felt within `width` ([rad] or [m]) of it.
+    """A catch that a joint snaps into at `position`, effective within `width` ([rad] or [m]) of it.
 
     At a distance x from the catch, |x| < width, it acts with -effort sin(2 pi x / width) ([N m] or
     [N]): the nearer half draws in, the farther half keeps out.
@@ -117,7 +117,7 @@ class Body:
     """A rigid body standing in the world; its pose is part of the `SceneState`.
 
     `mass` [kg], or `None` for one that never moves; `friction` is the Coulomb coefficient. A body
-    with a `joint` moves on another one only; `T_world_body` is then of no account.
+    with a `joint` moves on another one only; `T_world_body` is then ignored.
     """
 
     name: str
@@ -205,7 +205,7 @@ class SceneSpec:
         joint_positions: Mapping[str, float] | None = None,
         gripper_target: float | None = None,
     ) -> SceneState:
-        """The state with the robot at `q`, bodies where the scene has them or where told.
+        """The state with the robot at `q`, bodies where the scene has them or where given.
 
         Args:
             q: robot joints `(n,)` [rad].
@@ -215,7 +215,7 @@ class SceneSpec:
             gripper_target: command in force, where it differs from `gripper`.
 
         Raises:
-            UnknownName: a body told of isn't in the scene, or isn't of that sort.
+            UnknownName: a given body isn't in the scene, or isn't of that sort.
         """
         poses = {body.name: body.T_world_body for body in self.bodies if body.joint is None}
         for name, T in (Ts_world_body or {}).items():
@@ -286,19 +286,19 @@ class SceneSpec:
         return frozenset(name for name, count in fingers.items() if count >= 2)
 
     def outer_contacts(
-        self, touching: Iterable[tuple[str, str]], carried: Collection[str]
+        self, touching: Iterable[tuple[str, str]], grasped: Collection[str]
     ) -> frozenset[tuple[str, str]]:
-        """Those pairs in which the robot, or what it carries, touches what it doesn't carry.
+        """Those pairs in which the robot, or what it grasps, touches what it doesn't grasp.
 
         Args:
             touching: pairs of names that touch.
-            carried: names of bodies in the gripper's grasp.
+            grasped: names of bodies in the gripper's grasp.
         """
-        standing = {body.name for body in self.bodies}.difference(carried)
+        standing = {body.name for body in self.bodies}.difference(grasped)
         return frozenset(pair for pair in touching if len(standing.intersection(pair)) == 1)
 
     def check_state(self, state: SceneState) -> None:
-        """Refuse a state that isn't one of this scene; the robot's joints are not looked at.
+        """Refuse a state that isn't one of this scene; the robot's joints are not checked.
 
         Raises:
             UnknownName: it has a body that the scene hasn't, or lacks one.

@@ -119,7 +119,7 @@ class BottlePlacing(Task):
     def plan(self, state: SceneState) -> list[PlanStep]:
         p_floor = state.Ts_world_body["cup"][:3, 3] + [0, 0, FLOOR]
 
-        def leg(
+        def step(
             height: float, gripper: float, speed: float, tolerance: float, pause: float = 0.0
         ) -> PlanStep:
             """The bottle's bottom, while it is held, `height` above the cup's floor."""
@@ -127,8 +127,8 @@ class BottlePlacing(Task):
             return PlanStep(T, gripper, speed, tolerance, pause=pause)
 
         return [
-            leg(CUP_DEPTH + 0.03, _SQUEEZE, 0.08, 0.006),
-            leg(0.003, _SQUEEZE, 0.05, 0.004),
-            leg(0.003, 0.0, 0.02, 0.008, pause=0.5),
-            leg(0.09, 0.0, 0.06, 0.010, pause=0.5),
+            step(CUP_DEPTH + 0.03, _SQUEEZE, 0.08, 0.006),
+            step(0.003, _SQUEEZE, 0.05, 0.004),
+            step(0.003, 0.0, 0.02, 0.008, pause=0.5),
+            step(0.09, 0.0, 0.06, 0.010, pause=0.5),
         ]

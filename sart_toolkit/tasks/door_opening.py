@@ -139,7 +139,7 @@ class DoorOpening(Task):
         def behind_bar(distance: float, depth: float, opened_deg: float = 0.0) -> Array:
             """The tool that far behind the bar's axis, the fingertips so deep below it [m].
 
-            It goes round the hinge with the door but doesn't turn, so that the picture shows how
+            It goes round the hinge with the door but doesn't turn, so that the image shows how
             far the door is open.
             """
             T_door_tool = pose(_P_HINGE_BAR + [distance, _HOOK, _FINGERTIP - depth])

@@ -115,7 +115,7 @@ class LidClosing(Task):
         T_world_container = state.Ts_world_body["container"]
         R_world_tool = T_world_container[:3, :3] @ tool_down([0, 0, 0])[:3, :3]
 
-        def leg(height: float, speed: float, tolerance: float, pause: float = 0.0) -> PlanStep:
+        def step(height: float, speed: float, tolerance: float, pause: float = 0.0) -> PlanStep:
             """The tips `height` above the lid when shut."""
             T = np.eye(4)
             T[:3, :3] = R_world_tool
@@ -124,7 +124,7 @@ class LidClosing(Task):
             return PlanStep(T, _CLOSED, speed, tolerance, pause=pause)
 
         return [
-            leg(0.085, 0.08, 0.006),
-            leg(0.002, 0.05, 0.003, pause=0.1),
-            leg(0.04, 0.06, 0.006, pause=0.5),
+            step(0.085, 0.08, 0.006),
+            step(0.002, 0.05, 0.003, pause=0.1),
+            step(0.04, 0.06, 0.006, pause=0.5),
         ]

@@ -119,9 +119,9 @@ class PegInHole(Task):
         hole = state.Ts_world_body["block"]
         T = self._start()
         T[:3, :3] = hole[:3, :3] @ T[:3, :3]
-        legs = []
+        steps = []
         for tip_height, speed, tolerance in ((0.012, 0.07, 0.004), (-_INSERTION, 0.03, 0.003)):
-            T_leg = T.copy()
-            T_leg[:3, 3] = hole[:3, 3] + [0, 0, HOLE_DEPTH + tip_height + _PEG_TIP_BELOW_TOOL]
-            legs.append(PlanStep(T_leg, _GRIPPER, speed, tolerance))
-        return legs
+            T_step = T.copy()
+            T_step[:3, 3] = hole[:3, 3] + [0, 0, HOLE_DEPTH + tip_height + _PEG_TIP_BELOW_TOOL]
+            steps.append(PlanStep(T_step, _GRIPPER, speed, tolerance))
+        return steps

@@ -75,7 +75,7 @@ class PlanStep:
 
 
 class Task(abc.ABC):
-    """A skill to be learned, told without naming a simulator.
+    """A skill to be learned, described without naming a simulator.
 
     Attributes:
         name: what it is called in files and reports.

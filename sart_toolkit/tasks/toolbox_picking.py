@@ -91,17 +91,17 @@ class ToolboxPicking(Task):
         T = tool_down([0, 0, 0])
         T[:3, :3] = toolbox[:3, :3] @ T[:3, :3]
 
-        def leg(
+        def step(
             height: float, gripper: float, speed: float, tolerance: float, pause: float = 0.0
         ) -> PlanStep:
             """The tool's origin `height` above where the bar's middle is now."""
-            T_leg = T.copy()
-            T_leg[:3, 3] = toolbox[:3, 3] + [0, 0, BAR_HEIGHT + height]
-            return PlanStep(T_leg, gripper, speed, tolerance, pause=pause)
+            T_step = T.copy()
+            T_step[:3, 3] = toolbox[:3, 3] + [0, 0, BAR_HEIGHT + height]
+            return PlanStep(T_step, gripper, speed, tolerance, pause=pause)
 
         return [
-            leg(0.06, 0.0, 0.08, 0.006),
-            leg(0.0, 0.0, 0.05, 0.004),
-            leg(0.0, 1.0, 0.02, 0.008, pause=0.8),
-            leg(_RAISED, 1.0, 0.06, 0.006, pause=0.8),
+            step(0.06, 0.0, 0.08, 0.006),
+            step(0.0, 0.0, 0.05, 0.004),
+            step(0.0, 1.0, 0.02, 0.008, pause=0.8),
+            step(_RAISED, 1.0, 0.06, 0.006, pause=0.8),
         ]

@@ -82,14 +82,14 @@ class Bench:
             if not isinstance(self.backend, ability):
                 pytest.skip(f"backend {self.backend.name!r} lacks {ability.__name__}")
             if ability is Draws:
-                self.needs_pictures()
+                self.needs_images()
             self.relies_on(self.has(ability), _WORKS)
 
-    def needs_pictures(self) -> None:
-        """Skip the test where the backend takes no pictures."""
-        if self.backend.no_pictures:
-            pytest.skip(f"backend {self.backend.name!r} lacks pictures: {self.backend.no_pictures}")
-        self.relies_on(self.takes_pictures(), "test_a_backend_takes_pictures_or_says_why_not")
+    def needs_images(self) -> None:
+        """Skip the test where the backend takes no images."""
+        if self.backend.no_images:
+            pytest.skip(f"backend {self.backend.name!r} lacks images: {self.backend.no_images}")
+        self.relies_on(self.takes_images(), "test_a_backend_takes_images_or_says_why_not")
 
     def has(self, ability: type) -> bool:
         """Whether the backend has an ability that works."""
@@ -116,15 +116,15 @@ class Bench:
             return False
         return True
 
-    def takes_pictures(self) -> bool:
-        """Whether a picture comes back that was asked for."""
-        if "pictures" not in self._found:
+    def takes_images(self) -> bool:
+        """Whether an image comes back that was asked for."""
+        if "images" not in self._found:
             name = next(iter(self.backend.cameras))
             try:
-                self._found["pictures"] = name in self.see((name,), 8).cameras
+                self._found["images"] = name in self.see((name,), 8).cameras
             except MissingCapability:
-                self._found["pictures"] = False
-        return self._found["pictures"]
+                self._found["images"] = False
+        return self._found["images"]
 
     @property
     def resets(self) -> Resets:
@@ -151,7 +151,7 @@ class Bench:
         return require(self.backend, SensesContacts, _TESTED).contacts()
 
     def relies_on(self, holds: object, test: str) -> None:
-        """Skip the test where it can't tell anything before another one passes."""
+        """Skip the test where it means nothing before another one passes."""
         if not holds:
             pytest.skip(f"not judged before {test} passes")
 
@@ -246,9 +246,9 @@ class Bench:
 
     # --- what is compared -----------------------------------------------------------------------
 
-    def digest(self, pictures: bool = False) -> str:
-        """What is observed now but the time, to the bit; the first camera's picture if told."""
-        shown = pictures and not self.backend.no_pictures and self.takes_pictures()
+    def digest(self, images: bool = False) -> str:
+        """What is observed now but the time, to the bit; the first camera's image if asked for."""
+        shown = images and not self.backend.no_images and self.takes_images()
         return _digest(self.see(tuple(self.backend.cameras)[:1] if shown else (), 32))
 
     def continuation(self, periods: int = 6) -> list[str]:
@@ -258,7 +258,7 @@ class Bench:
         for i in range(1, periods + 1):
             self.command(q + 0.004 * i * np.cos(np.arange(len(q))), GRIPPER + 0.01 * i)
             touched = self.contacts() if self.has(SensesContacts) else []
-            seen.append(f"{self.digest(pictures=i == periods)} {touched}")
+            seen.append(f"{self.digest(images=i == periods)} {touched}")
         return seen
 
     def finger_opening(self) -> float:

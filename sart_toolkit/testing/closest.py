@@ -50,7 +50,7 @@ _ROUNDING = 1e-6
 class Nearest(NamedTuple):
     """Two bodies by name and their distance [m], negative where they overlap.
 
-    `a` is a link of the robot or a carried body. Where nothing is within reach of what was asked
+    `a` is a link of the robot or a grasped body. Where nothing is within reach of what was asked
     for, the names are empty and the distance is infinite.
     """
 
@@ -92,12 +92,12 @@ class _Carrier:
 
 @dataclass(frozen=True)
 class _Bounds:
-    """All pairs of parts that may be looked at, and what bounds their distances from below.
+    """All pairs of parts that may be considered, and what bounds their distances from below.
 
     Attributes:
         pairs: the two parts of each pair; first moving parts with standing ones, then moving ones
             among themselves.
-        not_looked_at: the indices of pairs that may touch.
+        ignored: the indices of pairs that may touch.
         spheres: of each rank, from 0 on, the centres `(4, n)` in the frame of the arm's link.
         radii: `(n,)` of all of them.
         starts: where each moving part's spheres begin.
@@ -108,7 +108,7 @@ class _Bounds:
     """
 
     pairs: list[tuple[_Part, _Part]]
-    not_looked_at: NDArray[np.intp]
+    ignored: NDArray[np.intp]
     spheres: list[Array]
     radii: Array
     starts: NDArray[np.intp]
@@ -146,15 +146,15 @@ class _Bounds:
         own -= self.radii[self.own_a] + self.radii[self.own_b]
         own = np.minimum.reduceat(own, self.own_starts, axis=1)
         bounds = np.concatenate([scene.transpose(0, 2, 1).reshape(m, -1), own], axis=1)
-        bounds[:, self.not_looked_at] = np.inf
+        bounds[:, self.ignored] = np.inf
         return bounds
 
 
 class ClosestPoints:
     """PyBullet's closest points between a robot and a scene at joint configurations.
 
-    Pairs that are looked at: every link that an arm joint moves, what is fixed to it, and every
-    carried body, each with every body that is not carried; links among themselves, and carried
+    Pairs that are considered: every link that an arm joint moves, what is fixed to it, and every
+    grasped body, each with every body that is not grasped; links among themselves, and grasped
     bodies with links, where at least `joints_apart` arm joints are between them. Shapes that don't
     collide are left out.
     """
@@ -248,33 +248,33 @@ class ClosestPoints:
         self,
         Ts_world_body: Mapping[str, Array],
         gripper: float,
-        T_tool_carried: Mapping[str, Array] = MappingProxyType({}),
+        T_tool_grasped: Mapping[str, Array] = MappingProxyType({}),
         allowed: Collection[tuple[str, str]] = (),
     ) -> None:
         """Put the bodies and the gripper where they are in what is asked next.
 
         Args:
-            Ts_world_body: poses `(4, 4)` of all bodies; of carried ones they are of no account.
+            Ts_world_body: poses `(4, 4)` of all bodies; those of grasped ones are ignored.
             gripper: where the gripper is, 0 open to 1 closed.
-            T_tool_carried: poses `(4, 4)` in the tool frame of the bodies that move with it.
-            allowed: pairs of names that may touch; they are not looked at.
+            T_tool_grasped: poses `(4, 4)` in the tool frame of the bodies that move with it.
+            allowed: pairs of names that may touch; they are not considered.
 
         Raises:
             InvalidInput: not a pose, or a gripper position out of range.
-            UnknownName: a carried body isn't in the scene, a body's pose is missing, or there is no
+            UnknownName: a grasped body isn't in the scene, a body's pose is missing, or there is no
                 link or body of an allowed pair's name.
         """
         c = self._client
         names = [body.name for body in self.scene.bodies]
-        for name in T_tool_carried:
+        for name in T_tool_grasped:
             if name not in names:
                 raise unknown_name("body", name, names)
         for name in names:
-            if name not in T_tool_carried and name not in Ts_world_body:
+            if name not in T_tool_grasped and name not in Ts_world_body:
                 raise unknown_name("body", name, Ts_world_body)
         for name in (name for pair in allowed for name in pair):
             self._of(name)
-        Ts_tool = {n: check_pose(f"T_tool_{n}", T) for n, T in T_tool_carried.items()}
+        Ts_tool = {n: check_pose(f"T_tool_{n}", T) for n, T in T_tool_grasped.items()}
         Ts_world = {
             n: check_pose(f"T_world_{n}", Ts_world_body[n]) for n in names if n not in Ts_tool
         }
@@ -361,7 +361,7 @@ class ClosestPoints:
         """Which of the configurations `qs (m, n)` [rad] has the nearest pair, and that pair.
 
         The same as the smallest of `nearest` of each, but faster: whatever spheres around the parts
-        show to be farther apart than the nearest pair isn't looked at. The index is -1 where
+        show to be farther apart than the nearest pair isn't considered. The index is -1 where
         nothing is less than `within` [m] apart.
 
         Raises:
@@ -374,7 +374,7 @@ class ClosestPoints:
             found.append((rows + first, columns, bounds[rows, columns]))
         rows, columns, values = (np.concatenate(each) for each in zip(*found, strict=True))
         best, at, row = _NOTHING, -1, -1
-        # Where two may overlap nothing is known of how deep: all of these are looked at, by
+        # Where two may overlap nothing is known of how deep: all of these are considered, by
         # configuration, which saves moving the arm; of the others the nearest first.
         for k in np.argsort(np.maximum(values, 0.0), kind="stable"):
             reach = min(within, best.distance)
@@ -417,7 +417,7 @@ class ClosestPoints:
     def pair(self, q: Array, a: str, b: str, within: float = np.inf) -> float:
         """The distance [m] of two links or bodies at `q (n,)` [rad]; infinite beyond `within`.
 
-        Any two may be asked for, also those that `nearest` doesn't look at. No part is left out.
+        Any two may be asked for, also those that `nearest` ignores. No part is left out.
 
         Raises:
             InvalidInput: `q` has the wrong shape or isn't finite.
@@ -515,7 +515,7 @@ def _make_bounds(
         starts.append(starts[-1] + len(part.spheres))
     moved = [i for i, (_, rank, _) in enumerate(moving) if rank > 0]
     pairs = [(moving[i][0], shape) for i in moved for shape, _ in standing]
-    looked_at = np.array([frozenset((a.name, b.name)) not in allowed for a, b in pairs], bool)
+    considered = np.array([frozenset((a.name, b.name)) not in allowed for a, b in pairs], bool)
     own = [
         (j, i)
         for i, (a, rank_a, _) in enumerate(moving)
@@ -529,7 +529,7 @@ def _make_bounds(
     counts = [grid[0].size for grid in sets]
     return _Bounds(
         pairs=pairs + [(moving[j][0], moving[i][0]) for j, i in own],
-        not_looked_at=np.flatnonzero(~looked_at),
+        ignored=np.flatnonzero(~considered),
         spheres=[np.concatenate(group, axis=1) for group in spheres],
         radii=np.concatenate(radii),
         starts=np.array([starts[i] for i in moved], np.intp),

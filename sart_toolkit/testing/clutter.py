@@ -236,7 +236,7 @@ def random_segment(
 
     Raises:
         InvalidInput: there is no scene, or nothing in it, to put lines beside.
-        MotionRejected: in 1000 tries no line was found that the robot can reach.
+        MotionRejected: in 1000 attempts no line was found that the robot can reach.
     """
     bodies = [] if scene is None else [b for b in scene.bodies if any(s.collides for s in b.shapes)]
     if beside_share > 0 and not bodies:

@@ -81,13 +81,13 @@ def jointed(_in_scene: Callable[[str], Bench]) -> Bench:
 def view(_in_scene: Callable[[str], Bench]) -> Bench:
     """Things to see."""
     bench = _in_scene("view")
-    bench.needs_pictures()
+    bench.needs_images()
     return bench
 
 
 @pytest.fixture
 def another(bench: Bench) -> Iterator[Make]:
-    """Makes fresh benches of the same backend and robot, in the same scene or in one told."""
+    """Makes fresh benches of the same backend and robot, in the same scene or in a given one."""
     made: list[Bench] = []
 
     def make(scene: SceneSpec | None = None) -> Bench:

@@ -1,6 +1,6 @@
-"""A screen that nobody looks at, with hands: windows under Xvfb, keys by xdotool, pictures of it.
+"""A virtual screen, with hands: windows under Xvfb, keys by xdotool, images of it.
 
-For tests of windows and for the programs that make the documentation's pictures.
+For tests of windows and for the programs that make the documentation's images.
 """
 
 from __future__ import annotations
@@ -125,13 +125,13 @@ class Desktop:
             self._xdotool("keyup", key)
 
     def screenshot(self, path: Path | None = None) -> Image.Image:
-        """The whole screen as a picture, written to `path` if there is one."""
-        picture = ImageGrab.grab(xdisplay=self.display)
-        if picture.mode != "RGB":
-            picture = picture.convert("RGB")
+        """The whole screen as an image, written to `path` if there is one."""
+        image = ImageGrab.grab(xdisplay=self.display)
+        if image.mode != "RGB":
+            image = image.convert("RGB")
         if path is not None:
-            picture.save(path)
-        return picture
+            image.save(path)
+        return image
 
     def _answer(self, *arguments: str) -> list[str]:
         """What xdotool prints, in words; none where it fails."""

@@ -51,7 +51,7 @@ def site(robot: RobotSpec) -> Array:
 
 
 def _specks(robot: RobotSpec) -> tuple[Attachment, ...]:
-    """Specks that collide with nothing, on the finger links: they tell where the fingers are."""
+    """Specks that collide with nothing, on the finger links: they show where the fingers are."""
     speck = Shape("box", (0.002, 0.002, 0.002), collides=False)
     return tuple(
         Attachment(f"speck{i}", link, (speck,), mass=0.001)
@@ -167,9 +167,9 @@ def jointed_scene(robot: RobotSpec) -> SceneSpec:
 def view_scene(robot: RobotSpec) -> SceneSpec:
     """A green ball and a magenta bead before three cameras, and a room underground with a fourth.
 
-    The ball is at the middle of the cameras' pictures, the bead off it, so that where they appear
-    tells how a camera stands whatever its field of view. The room's walls all look alike and are
-    equally far away, so that the camera in its middle tells its field of view and its depth even
+    The ball is at the middle of the cameras' images, the bead off it, so that where they appear
+    shows how a camera stands whatever its field of view. The room's walls all look alike and are
+    equally far away, so that the camera in its middle shows its field of view and its depth even
     where it looks along a wrong axis. The camera `nowhere` has nothing before it.
     """
     T = site(robot)

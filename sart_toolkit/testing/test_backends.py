@@ -54,18 +54,18 @@ def test_rates_are_those_asked_for(bench: Bench) -> None:
 @pytest.mark.parametrize("ability", ABILITIES, ids=[ability.__name__ for ability in ABILITIES])
 def test_an_ability_that_a_backend_has_works(bench: Bench, ability: type) -> None:
     """One that isn't there would be found out in the middle of a run."""
-    if ability is Draws and bench.backend.no_pictures:
-        pytest.skip(f"backend {bench.backend.name!r} lacks pictures: {bench.backend.no_pictures}")
+    if ability is Draws and bench.backend.no_images:
+        pytest.skip(f"backend {bench.backend.name!r} lacks images: {bench.backend.no_images}")
     if isinstance(bench.backend, ability):
         assert bench.does(ability)
 
 
-def test_a_backend_takes_pictures_or_says_why_not(bench: Bench) -> None:
+def test_a_backend_takes_images_or_says_why_not(bench: Bench) -> None:
     """With MissingCapability: nothing is silently left out."""
-    if not bench.backend.no_pictures:
-        assert bench.takes_pictures()
+    if not bench.backend.no_images:
+        assert bench.takes_images()
         return
-    with pytest.raises(MissingCapability, match="takes no pictures"):
+    with pytest.raises(MissingCapability, match="takes no images"):
         bench.see((next(iter(bench.backend.cameras)),), 8)
 
 
@@ -90,7 +90,7 @@ def test_two_instances_do_the_same(bench: Bench, another: Make) -> None:
 
 
 def test_two_instances_are_independent(bench: Bench, another: Make) -> None:
-    """What one is told and does, the other doesn't notice."""
+    """What one is commanded and does, the other doesn't notice."""
     bench.relies_on_repeating()
     expected = bench.continuation()
     bench.reset()
@@ -103,7 +103,7 @@ def test_two_instances_are_independent(bench: Bench, another: Make) -> None:
         bench.backend.step()
         touched = bench.contacts() if bench.has(SensesContacts) else []
         other.backend.step()
-        seen.append(f"{bench.digest(pictures=i == 6)} {touched}")
+        seen.append(f"{bench.digest(images=i == 6)} {touched}")
     assert seen == expected
 
 

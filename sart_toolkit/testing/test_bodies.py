@@ -85,7 +85,7 @@ def test_restore_returns_free_bodies(loose: Bench) -> None:
     np.testing.assert_array_equal(_brick(loose), before)
 
 
-def test_a_falling_body_goes_on_falling_after_a_restore(loose: Bench) -> None:
+def test_a_falling_body_keeps_falling_after_a_restore(loose: Bench) -> None:
     """Velocities are part of the state."""
     loose.needs(SavesStates)
     loose.reset(Ts_world_body=_lifted(loose, 0.5))
@@ -259,7 +259,7 @@ def test_a_detent_pushes_out_from_its_farther_half(jointed: Bench, kind: str) ->
     assert path.max() > detent.position + detent.width, "it is not pushed out"
     outside = detent.position + 1.2 * detent.width
     path = _path(jointed, f"caught_{kind}", outside, 0.3)
-    assert np.abs(path - outside).max() < 1e-3, "it is felt beyond its width"
+    assert np.abs(path - outside).max() < 1e-3, "it acts beyond its width"
 
 
 def test_the_tool_pushes_a_jointed_body(jointed: Bench) -> None:
@@ -279,7 +279,7 @@ def test_restore_returns_jointed_bodies(jointed: Bench) -> None:
     assert jointed.positions() == before
 
 
-def test_a_swinging_body_goes_on_swinging_after_a_restore(jointed: Bench) -> None:
+def test_a_swinging_body_keeps_swinging_after_a_restore(jointed: Bench) -> None:
     """Joint velocities are part of the state."""
     jointed.needs(SavesStates)
     jointed.wait(0.3)

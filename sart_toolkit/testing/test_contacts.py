@@ -54,7 +54,7 @@ def test_contact_is_reported_when_bodies_touch(touch: Bench) -> None:
 
 
 def test_contact_is_not_reported_a_millimetre_before(touch: Bench) -> None:
-    """A margin at which a simulator begins to look is no contact."""
+    """A margin within which a simulator starts checking is no contact."""
     for contacts in touch.lower_stick(0.001):
         assert _STICK_ON_BLOCK not in _pairs(contacts)
 

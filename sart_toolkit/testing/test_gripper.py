@@ -65,7 +65,7 @@ def grasp(loose: Bench) -> Grasp:
     key = (loose.backend_name, loose.robot_name)
     if key not in _GRASPS:
         _GRASPS[key] = _grasp(loose)
-    # Without the gripper's motion nothing below can be told.
+    # Without the gripper's motion nothing below can be tested.
     loose.relies_on(_GRASPS[key].closed, "test_the_gripper_goes_where_commanded")
     return _GRASPS[key]
 

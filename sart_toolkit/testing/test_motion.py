@@ -25,7 +25,7 @@ def test_commanded_joints_are_reached(bench: Bench) -> None:
 
 
 def test_joints_follow_at_the_commanded_speed(bench: Bench) -> None:
-    """They are where they are told to be at the end of each control period, not some time later."""
+    """They reach what is commanded by the end of each control period, not some time later."""
     speed = np.linspace(0.2, 0.8, len(bench.ready))
     late = []
     for i in range(1, 16):

@@ -102,7 +102,7 @@ def test_the_same_commands_give_the_same_trajectory(bench: Bench) -> None:
 
 
 def test_what_follows_a_reset_depends_on_the_state_alone(bench: Bench) -> None:
-    """A solver remembers earlier contacts unless it is told to forget them."""
+    """A solver remembers earlier contacts unless it is made to forget them."""
     bench.relies_on_repeating()
     expected = bench.continuation()
     _moved(bench)
@@ -158,7 +158,7 @@ def test_restore_returns_the_time(bench: Bench) -> None:
 
 
 def test_restore_returns_the_commands_in_force(bench: Bench) -> None:
-    """A step without a new command goes on to the targets that were set when it was saved."""
+    """A step without a new command continues to the targets that were set when it was saved."""
     bench.needs(SavesStates)
     bench.reset(gripper=0.2)
     bench.backend.command(bench.ready + 0.01, 0.8)
@@ -196,7 +196,7 @@ def test_saving_changes_nothing(bench: Bench) -> None:
 
 
 def test_what_follows_a_restore_depends_on_the_saved_state_alone(bench: Bench) -> None:
-    """To the bit, contacts and pictures included, whatever ran in between."""
+    """To the bit, contacts and images included, whatever ran in between."""
     bench.needs(SavesStates)
     bench.relies_on_repeating()
     state = _pressing(bench)
@@ -209,7 +209,7 @@ def test_what_follows_a_restore_depends_on_the_saved_state_alone(bench: Bench) -
     ):
         between()
         bench.states.restore(state)
-        continuations.append([bench.digest(pictures=True), *bench.continuation()])
+        continuations.append([bench.digest(images=True), *bench.continuation()])
     for continuation in continuations[1:]:
         assert continuation == continuations[0]
 

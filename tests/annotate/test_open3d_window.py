@@ -57,7 +57,7 @@ def test_every_key_does_in_the_window_what_the_table_says(
     keys = [key for key, name in KEYS.items() if name not in ("save", "quit")]
     for key in ["A", *keys]:
         done = len(rows(tmp_path))
-        # A window takes keys only once its first picture stands.
+        # A window takes keys only once its first image stands.
         screen.key(x_name(key))
         wait_until(lambda done=done: len(rows(tmp_path)) > done, 60)
         assert rows(tmp_path)[-1]["action"] == KEYS[key]
@@ -65,7 +65,7 @@ def test_every_key_does_in_the_window_what_the_table_says(
     screen.key("Home")
     wait_until(lambda: screen.screenshot().tobytes() != before, 60)
 
-    # What a killed window has done is gone on with by the next one.
+    # The next window continues what a killed one has done.
     n = len(rows(tmp_path)) - 1
     program.kill()
     program.wait()
@@ -108,7 +108,7 @@ def test_every_key_has_a_number_of_open3d(window_module):
     assert set(window_module._KEY_NAMES.values()) == set(KEYS) - {"Escape"}
 
 
-def test_without_open3d_the_remedy_is_told(monkeypatch):
+def test_without_open3d_the_remedy_is_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     monkeypatch.delitem(sys.modules, "sart_toolkit.annotate.open3d_window", raising=False)
     with pytest.raises(MissingExtra, match=r"pip install sart_toolkit\[annotate\].*--no-window"):

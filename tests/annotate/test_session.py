@@ -299,7 +299,7 @@ def test_numbers_choose_a_waypoint_and_a_radius(session):
     assert rows(session.spheres)[0][:2] == (7, 0.0125)
 
 
-def test_an_unknown_key_or_action_is_told(session):
+def test_an_unknown_key_or_action_is_reported(session):
     assert not session.press("F1") and session.presses == 0
     with pytest.raises(UnknownName, match="unknown action 'suggestall': did you mean 'suggest-all"):
         session.perform("suggestall")
@@ -433,7 +433,7 @@ def test_a_journal_done_again_equals_the_live_state(open_session, tmp_path, acti
             assert rows(live) == rows(replayed)
 
 
-def test_an_interrupted_session_goes_on_and_says_so(session, open_session, tmp_path):
+def test_an_interrupted_session_resumes_and_says_so(session, open_session, tmp_path):
     session._clock.now = 30.0
     press(session, "A", "Right", "Backspace", "Home", "Up")
     again = open_session()
@@ -574,9 +574,9 @@ def test_a_kill_at_any_moment_loses_the_last_key_press_at_most(open_session, tmp
                 break
         process.send_signal(signal.SIGKILL)
         lines += process.communicate()[0].splitlines(keepends=True)
-        told = [x.strip().split(";") for x in lines if x.endswith("\n") and ";" in x]
+        printed = [x.strip().split(";") for x in lines if x.endswith("\n") and ";" in x]
         session = open_session()
-        presses, selected, state = told[-1]
+        presses, selected, state = printed[-1]
         assert session.presses in (int(presses), int(presses) + 1)
         if session.presses == int(presses):
             assert session.selected == int(selected)

@@ -107,8 +107,8 @@ class Elsewhere:
 
     def __init__(self, demonstration, robot, scene):
         Ts = {k: T @ pose([0, 0, -5]) for k, T in demonstration.body_Ts_world.items()}
-        shown = dataclasses.replace(demonstration, body_Ts_world=Ts)
-        self.world = ExactWorld(shown, robot, scene)
+        demo = dataclasses.replace(demonstration, body_Ts_world=Ts)
+        self.world = ExactWorld(demo, robot, scene)
 
 
 def test_suggested_spheres_start_at_waypoint_0_and_tile_the_free_part(
@@ -165,7 +165,7 @@ def test_what_limits_a_radius_is_a_pair_at_the_stated_clearance(
 def test_every_pose_that_augmentation_draws_keeps_the_whole_robot_clear(
     peg_demonstration, peg_world, peg_annotation
 ):
-    """Monte Carlo by the paper's law, on each sphere and inside it."""
+    """Monte Carlo by the paper's distribution, on each sphere and inside it."""
     rng = np.random.default_rng(0)
     margin = SuggestConfig().margin
     for sphere in peg_annotation.spheres:
@@ -248,12 +248,12 @@ def test_the_waypoint_that_a_segment_starts_from_must_be_clear_too(
     """The block stands in the robot's way from one waypoint on."""
     Ts = np.array(peg_demonstration.body_Ts_world["block"])
     Ts[12:, 2, 3] += 0.15
-    shown = dataclasses.replace(
+    demo = dataclasses.replace(
         peg_demonstration, body_Ts_world={**peg_demonstration.body_Ts_world, "block": Ts}
     )
-    scene = ExactWorld(shown, peg_model.spec, peg_task.scene)
-    found = suggest_radius(scene, shown, 0)
-    p = shown.steps.measured_Ts_world_tool[:, :3, 3]
+    scene = ExactWorld(demo, peg_model.spec, peg_task.scene)
+    found = suggest_radius(scene, demo, 0)
+    p = demo.steps.measured_Ts_world_tool[:, :3, 3]
     assert "at waypoint" in found.limited_by
     assert found.radius < np.linalg.norm(p[12] - p[0])
 

@@ -1,4 +1,4 @@
-"""Segments proved clear of what the wrist camera saw: nothing of the scene is looked at."""
+"""Segments proved clear of what the wrist camera saw: nothing of the scene is used."""
 
 import dataclasses
 

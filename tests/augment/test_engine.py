@@ -200,9 +200,9 @@ def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_
             seen = peg_backend.observe(("wrist",))
             np.testing.assert_array_equal(seen.q, steps.joint_positions[i])
             np.testing.assert_array_equal(seen.T_world_tool, steps.measured_Ts_world_tool[i])
-            picture = steps.cameras["wrist"]
-            np.testing.assert_array_equal(seen.cameras["wrist"].rgb, picture.rgb[i])
-            np.testing.assert_array_equal(seen.cameras["wrist"].depth, picture.depth[i])
+            image = steps.cameras["wrist"]
+            np.testing.assert_array_equal(seen.cameras["wrist"].rgb, image.rgb[i])
+            np.testing.assert_array_equal(seen.cameras["wrist"].depth, image.depth[i])
 
 
 def test_an_attempt_depends_on_seed_sphere_and_number_alone(
@@ -280,18 +280,18 @@ def test_a_line_too_fast_for_the_joints_takes_longer_and_the_episode_says_so(
         assert len(episode) == round(10 * duration)
 
 
-def test_a_start_in_collision_is_told_with_the_pair_and_by_how_much(
+def test_a_start_in_collision_is_reported_with_the_pair_and_by_how_much(
     peg_demonstration, peg_task, peg_backend, augment, annotate, tmp_path
 ):
     """The block stands where the peg is when the segment starts."""
     sunk = np.array(peg_demonstration.body_Ts_world["block"])
     sunk[:, 2, 3] += 0.2
-    shown = dataclasses.replace(
+    demo = dataclasses.replace(
         peg_demonstration, body_Ts_world={**peg_demonstration.body_Ts_world, "block": sunk}
     )
-    Ts = shown.steps.measured_Ts_world_tool
-    annotation = Annotation((PrecisionSphere(20, Ts[20], 0.01),), shown.content_hash())
-    attempt = RestoreExecutor(peg_backend, [(shown, annotation)], AugmentConfig()).attempt(
+    Ts = demo.steps.measured_Ts_world_tool
+    annotation = Annotation((PrecisionSphere(20, Ts[20], 0.01),), demo.content_hash())
+    attempt = RestoreExecutor(peg_backend, [(demo, annotation)], AugmentConfig()).attempt(
         AttemptKey(0, 0, 0)
     )
     assert attempt.outcome.startswith("start too close")
@@ -775,12 +775,12 @@ def test_an_attempt_on_a_backend_that_cannot_restore_is_refused(
         executor.attempt(AttemptKey(0, 0, 0))
 
 
-def test_a_backend_without_pictures_is_refused_unless_none_are_wanted(
+def test_a_backend_without_images_is_refused_unless_none_are_wanted(
     peg_demonstration, peg_backend, limited
 ):
     blind = limited(peg_backend, SavesStates, KnowsBodies)
-    blind.no_pictures = "it has no eyes"
-    with pytest.raises(MissingCapability, match="takes no pictures: it has no eyes"):
+    blind.no_images = "it has no eyes"
+    with pytest.raises(MissingCapability, match="takes no images: it has no eyes"):
         RestoreExecutor.check(blind, [peg_demonstration], AugmentConfig())
     RestoreExecutor.check(blind, [peg_demonstration], AugmentConfig(cameras=()))
 

@@ -40,7 +40,7 @@ def backend(request, task):
 
 
 @pytest.fixture(scope="module")
-def shown(task, model, backend):
+def demo(task, model, backend):
     operator = ScriptedOperator(
         task.plan(task.initial_state(model, Placement())), np.random.default_rng(0)
     )
@@ -48,88 +48,88 @@ def shown(task, model, backend):
 
 
 @pytest.fixture(scope="module")
-def carried_at(task, model, shown):
+def grasped_at(task, model, demo):
     fingers = model.spec.gripper.finger_links
-    return [task.scene.grasped(touching, fingers) for touching in shown.touching]
+    return [task.scene.grasped(touching, fingers) for touching in demo.touching]
 
 
 @pytest.fixture(scope="module")
-def world(task, model, shown):
-    return ExactWorld(shown, model.spec, task.scene)
+def world(task, model, demo):
+    return ExactWorld(demo, model.spec, task.scene)
 
 
 @pytest.fixture(scope="module")
-def annotation(shown, world):
-    return suggest_annotation(shown, world)
+def annotation(demo, world):
+    return suggest_annotation(demo, world)
 
 
-def sphere_at(shown, t, radius):
-    sphere = PrecisionSphere(t, shown.steps.measured_Ts_world_tool[t], radius)
-    return Annotation((sphere,), shown.content_hash())
+def sphere_at(demo, t, radius):
+    sphere = PrecisionSphere(t, demo.steps.measured_Ts_world_tool[t], radius)
+    return Annotation((sphere,), demo.content_hash())
 
 
-def test_a_demonstration_keeps_what_touched_and_so_when_it_was_grasped(shown, carried_at, tmp_path):
-    first = carried_at.index({"toolbox"})
-    assert 10 < first < len(shown) - 10
-    assert all(carried == {"toolbox"} for carried in carried_at[first + 1 :])
-    assert ("table", "toolbox") in shown.touching[1]
-    assert ("table", "toolbox") not in shown.touching[-1]
-    save_demonstration(tmp_path / "demo.h5", shown)
-    assert load_demonstration(tmp_path / "demo.h5").touching == shown.touching
-    other = dataclasses.replace(shown, touching=((),) * len(shown))
-    assert other.content_hash() != shown.content_hash()
+def test_a_demonstration_keeps_what_touched_and_so_when_it_was_grasped(demo, grasped_at, tmp_path):
+    first = grasped_at.index({"toolbox"})
+    assert 10 < first < len(demo) - 10
+    assert all(grasped == {"toolbox"} for grasped in grasped_at[first + 1 :])
+    assert ("table", "toolbox") in demo.touching[1]
+    assert ("table", "toolbox") not in demo.touching[-1]
+    save_demonstration(tmp_path / "demo.h5", demo)
+    assert load_demonstration(tmp_path / "demo.h5").touching == demo.touching
+    other = dataclasses.replace(demo, touching=((),) * len(demo))
+    assert other.content_hash() != demo.content_hash()
 
 
 def test_every_sphere_rejoins_before_the_gripper_or_a_contact_changes(
-    task, shown, carried_at, annotation
+    task, demo, grasped_at, annotation
 ):
-    commands = shown.steps.commanded_gripper
+    commands = demo.steps.commanded_gripper
     for sphere in annotation.spheres:
-        t, t_star = sphere.waypoint, convergence_waypoint(shown, sphere)
+        t, t_star = sphere.waypoint, convergence_waypoint(demo, sphere)
         assert len(set(np.round(commands[t : t_star + 1], 2))) == 1
-        assert len(set(carried_at[t : t_star + 1])) == 1
+        assert len(set(grasped_at[t : t_star + 1])) == 1
         for s in range(t, t_star + 1):
-            assert not task.scene.outer_contacts(shown.touching[s], carried_at[s])
+            assert not task.scene.outer_contacts(demo.touching[s], grasped_at[s])
 
 
-def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, carried_at):
-    carrying = [bool(carried_at[sphere.waypoint]) for sphere in annotation.spheres]
-    assert not carrying[0] and carrying[-1]
-    assert carrying == sorted(carrying)
+def test_there_are_spheres_before_the_grasp_and_while_lifting(annotation, grasped_at):
+    grasping = [bool(grasped_at[sphere.waypoint]) for sphere in annotation.spheres]
+    assert not grasping[0] and grasping[-1]
+    assert grasping == sorted(grasping)
     reasons = [sphere.limited_by for sphere in annotation.spheres]
     assert any("gripper command at waypoint" in reason for reason in reasons)
     assert any(reason == "toolbox / table" for reason in reasons)
 
 
 def test_a_waypoint_in_a_contact_or_at_the_gripper_s_event_is_refused_with_that_reason(
-    shown, world, carried_at
+    demo, world, grasped_at
 ):
-    closing = next(s for s in range(len(shown)) if shown.steps.commanded_gripper[s] > 0.5)
-    standing = carried_at.index({"toolbox"}) + 1
+    closing = next(s for s in range(len(demo)) if demo.steps.commanded_gripper[s] > 0.5)
+    standing = grasped_at.index({"toolbox"}) + 1
     for t, reason in (
         (closing - 1, rf"\(gripper command at waypoint {closing}\)"),
         (standing, r"\(contact table / toolbox\)"),
     ):
         with pytest.raises(InvalidInput, match=rf"waypoint {t}: no room for a sphere .* {reason}"):
-            suggest_annotation(shown, world, [t])
+            suggest_annotation(demo, world, [t])
 
 
 def test_a_segment_with_the_object_in_the_grasp_is_kept_and_brings_it_along(
-    backend, model, shown, annotation, carried_at
+    backend, model, demo, annotation, grasped_at
 ):
     config = AugmentConfig(n=8)
     i = len(annotation.spheres) - 1
-    attempt = RestoreExecutor(backend, [(shown, annotation)], config).attempt(AttemptKey(0, i, 0))
+    attempt = RestoreExecutor(backend, [(demo, annotation)], config).attempt(AttemptKey(0, i, 0))
     assert attempt.outcome == KEPT
     lifted = backend.observe().Ts_world_body["toolbox"][2, 3]
     assert lifted > 0.01
 
 
 def test_a_try_with_an_object_in_the_grasp_does_not_depend_on_those_before(
-    backend, shown, annotation
+    backend, demo, annotation
 ):
-    """Contacts that are there when a state is restored must leave nothing behind."""
-    make = RestoreExecutor(backend, [(shown, annotation)], AugmentConfig(n=8)).attempt
+    """Contacts that exist when a state is restored must leave nothing behind."""
+    make = RestoreExecutor(backend, [(demo, annotation)], AugmentConfig(n=8)).attempt
     i = len(annotation.spheres) - 1
     first = make(AttemptKey(0, i, 0))
     make(AttemptKey(0, i, 1))
@@ -139,13 +139,13 @@ def test_a_try_with_an_object_in_the_grasp_does_not_depend_on_those_before(
 
 
 def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
-    backend, model, shown, carried_at
+    backend, model, demo, grasped_at
 ):
-    height = shown.body_Ts_world["toolbox"][:, 2, 3]
-    t = next(s for s in range(len(shown)) if carried_at[s] and height[s] > 0.012)
+    height = demo.body_Ts_world["toolbox"][:, 2, 3]
+    t = next(s for s in range(len(demo)) if grasped_at[s] and height[s] > 0.012)
     config = AugmentConfig(n=8)
     outcomes = {
-        RestoreExecutor(backend, [(shown, sphere_at(shown, t, 0.04))], config)
+        RestoreExecutor(backend, [(demo, sphere_at(demo, t, 0.04))], config)
         .attempt(AttemptKey(0, 0, k))
         .outcome
         for k in range(12)
@@ -153,26 +153,26 @@ def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
     assert "path too close toolbox / table" in outcomes
 
 
-def test_a_segment_on_which_the_object_slips_is_rejected(backend, shown, annotation):
+def test_a_segment_on_which_the_object_slips_is_rejected(backend, demo, annotation):
     i = len(annotation.spheres) - 1
     config = AugmentConfig(n=8, slip_tolerance=0.0)
-    attempt = RestoreExecutor(backend, [(shown, annotation)], config).attempt(AttemptKey(0, i, 0))
+    attempt = RestoreExecutor(backend, [(demo, annotation)], config).attempt(AttemptKey(0, i, 0))
     assert attempt.outcome == "toolbox slipped in the grasp"
     assert attempt.episode is None
 
 
 def test_a_segment_on_which_the_open_fingers_touch_the_object_is_rejected(
-    backend, model, shown, carried_at
+    backend, model, demo, grasped_at
 ):
-    t = next(s for s in range(len(shown)) if shown.steps.commanded_gripper[s] > 0.5) - 2
+    t = next(s for s in range(len(demo)) if demo.steps.commanded_gripper[s] > 0.5) - 2
     config = AugmentConfig(n=8)
     outcomes = [
-        RestoreExecutor(backend, [(shown, sphere_at(shown, t - 1, 0.003))], config).attempt(
+        RestoreExecutor(backend, [(demo, sphere_at(demo, t - 1, 0.003))], config).attempt(
             AttemptKey(0, 0, k)
         )
         for k in range(2)
     ]
     assert all(attempt.outcome == KEPT for attempt in outcomes)
-    wide = sphere_at(shown, t - 1, 0.06)
-    make = RestoreExecutor(backend, [(shown, wide)], config).attempt
+    wide = sphere_at(demo, t - 1, 0.06)
+    make = RestoreExecutor(backend, [(demo, wide)], config).attempt
     assert any("path too close" in make(AttemptKey(0, 0, k)).outcome for k in range(8))

@@ -1,6 +1,6 @@
 """Segments round a wall that stands in the ball: kept where straight ones must be rejected.
 
-The scene is the one that `tools/planned_picture.py` draws.
+The scene is the one that `tools/planned_image.py` draws.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks.task import Placement
 
-_PATH = Path(__file__).parents[2] / "tools" / "planned_picture.py"
-_SPEC = importlib.util.spec_from_file_location("planned_picture", _PATH)
+_PATH = Path(__file__).parents[2] / "tools" / "planned_image.py"
+_SPEC = importlib.util.spec_from_file_location("planned_image", _PATH)
 assert _SPEC is not None and _SPEC.loader is not None
-picture = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(picture)
+image = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(image)
 
 DRAWS = 30
 RADIUS = 0.18
@@ -51,7 +51,7 @@ RADIUS = 0.18
 
 @pytest.fixture(scope="module")
 def task():
-    return picture.WalledPegInHole()
+    return image.WalledPegInHole()
 
 
 @pytest.fixture(scope="module")
@@ -263,23 +263,23 @@ def test_two_processes_generate_the_same_as_one_and_it_holds_when_checked_again(
     assert not found.problems and found.episodes == 12
 
 
-# --- the picture --------------------------------------------------------------------------------
+# --- the image --------------------------------------------------------------------------------
 
 
-def test_the_picture_is_drawn_and_its_counts_are_told(tmp_path, capsys):
+def test_the_image_is_drawn_and_its_counts_are_reported(tmp_path, capsys):
     pytest.importorskip("ompl")
-    out = tmp_path / "pictures" / "planned.png"
-    assert picture.main(["--out", str(out), "--draws", "6"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["draws"] == 6 and "ompl" in told["versions"]
+    out = tmp_path / "images" / "planned.png"
+    assert image.main(["--out", str(out), "--draws", "6"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["draws"] == 6 and "ompl" in report["versions"]
     for name in ("sart", "sart_planned"):
-        assert told["kept"][name] + sum(told["rejected"][name].values()) == 6
-    with Image.open(out) as image:
-        assert image.width > 1000
+        assert report["kept"][name] + sum(report["rejected"][name].values()) == 6
+    with Image.open(out) as drawn:
+        assert drawn.width > 1000
 
 
-def test_the_picture_without_ompl_says_how_to_install_it(tmp_path, capsys, monkeypatch):
+def test_the_image_without_ompl_says_how_to_install_it(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl", None)
-    assert picture.main(["--out", str(tmp_path / "planned.png")]) == 2
+    assert image.main(["--out", str(tmp_path / "planned.png")]) == 2
     assert "pip install 'sart_toolkit[planning]'" in capsys.readouterr().err
     assert not (tmp_path / "planned.png").exists()

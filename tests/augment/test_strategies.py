@@ -278,7 +278,7 @@ def test_an_unknown_strategy_is_refused_with_the_nearest_name():
         get_strategy("srat")
 
 
-def test_an_unknown_sampling_law_is_refused_with_the_nearest_name():
+def test_an_unknown_sampling_distribution_is_refused_with_the_nearest_name():
     with pytest.raises(UnknownName, match="sampling distribution 'papers': did you mean 'paper'"):
         SamplingConfig(distribution="papers")
 

@@ -1,4 +1,4 @@
-"""A dataset that was tampered with is told, whatever was changed in it."""
+"""A dataset that was tampered with is reported, whatever was changed in it."""
 
 import dataclasses
 import json
@@ -68,7 +68,7 @@ def test_what_was_generated_holds(made, validate):
     assert found.largest_deviation == pytest.approx(max(p["deviation"] for p in proofs), abs=2e-6)
 
 
-def test_a_truncated_episode_and_a_missing_one_are_told_and_the_others_still_checked(
+def test_a_truncated_episode_and_a_missing_one_are_reported_and_the_others_still_checked(
     copy, validate
 ):
     torn, missing, _ = (entry.name for entry in load_dataset(copy).index)
@@ -80,7 +80,7 @@ def test_a_truncated_episode_and_a_missing_one_are_told_and_the_others_still_che
     assert "no such file" in found.problems[missing]
 
 
-def test_a_flipped_bit_is_told_by_the_hash(copy, validate):
+def test_a_flipped_bit_is_reported_by_the_hash(copy, validate):
     name = load_dataset(copy).index[0].name
     file = copy / name
     content = bytearray(file.read_bytes())
@@ -90,7 +90,7 @@ def test_a_flipped_bit_is_told_by_the_hash(copy, validate):
     assert "content differs from its hash" in validate(copy).problems[name]
 
 
-def test_an_episode_exchanged_for_a_good_one_is_told_by_the_index(copy, validate):
+def test_an_episode_exchanged_for_a_good_one_is_reported_by_the_index(copy, validate):
     good, exchanged, _ = (entry.name for entry in load_dataset(copy).index)
     shutil.copy(copy / good, copy / exchanged)
     assert "content differs from its hash" in validate(copy).problems[exchanged]
@@ -149,12 +149,12 @@ def steps(**changes):
         (steps(measured_Ts_world_tool=lambda T: T[::-1]), "poses and joints don't belong together"),
     ],
 )
-def test_whatever_is_changed_is_told_though_all_hashes_fit(copy, validate, tamper, message):
+def test_whatever_is_changed_is_reported_though_all_hashes_fit(copy, validate, tamper, message):
     name = change(copy, **tamper(load_dataset(copy).episode(0)))
     assert re.search(message, validate(copy).problems[name])
 
 
-def test_an_episode_with_a_step_too_few_is_told(copy, validate):
+def test_an_episode_with_a_step_too_few_is_reported(copy, validate):
     episode = load_dataset(copy).episode(0)
     shorter = {
         f.name: getattr(episode.steps, f.name)[1:]

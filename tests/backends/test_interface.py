@@ -89,7 +89,7 @@ def _ray_cast(bench, camera, size):
 @pytest.mark.parametrize("size", [33, 64, 128])
 @pytest.mark.parametrize("camera", ["left", "right"])
 def test_depth_is_that_of_a_ray_cast_to_a_fifth_of_a_millimetre(view, camera, size):
-    view.needs_pictures()
+    view.needs_images()
     depth = view.see((camera,), size).cameras[camera].depth
     expected = _ray_cast(view, camera, size)
     # The robot hides some, and the balls are made of facets; at an edge a pixel may show either.
@@ -99,7 +99,7 @@ def test_depth_is_that_of_a_ray_cast_to_a_fifth_of_a_millimetre(view, camera, si
     assert (difference > 2e-4).mean() < 0.02
 
 
-def test_an_ability_is_had_or_its_lack_is_told_with_the_purpose(limited):
+def test_an_ability_is_had_or_its_lack_is_reported_with_the_purpose(limited):
     backend = make_backend("pybullet", get_robot("ur5e_hande"), SceneSpec(()), 8)
     assert require(backend, Resets, "tests reset it") is backend
     core = limited(backend, Resets)
@@ -110,12 +110,12 @@ def test_an_ability_is_had_or_its_lack_is_told_with_the_purpose(limited):
     backend.close()
 
 
-def test_a_backend_without_pictures_still_tells_a_camera_that_is_not_there(limited):
+def test_a_backend_without_images_still_tells_a_camera_that_is_not_there(limited):
     backend = limited(make_backend("pybullet", get_robot("ur5e_hande"), SceneSpec(()), 8))
-    backend.no_pictures = "its lens is broken"
+    backend.no_images = "its lens is broken"
     backend.check_cameras(())
     with pytest.raises(UnknownName, match="unknown camera 'wirst': did you mean 'wrist'"):
         backend.check_cameras(("wirst",))
-    with pytest.raises(MissingCapability, match="takes no pictures: its lens is broken; use an"):
+    with pytest.raises(MissingCapability, match="takes no images: its lens is broken; use an"):
         backend.check_cameras(("wrist",))
     backend.close()

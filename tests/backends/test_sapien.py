@@ -1,4 +1,4 @@
-"""What only SAPIEN has: its linkage, dry friction, rebuilt physics, and a probe for pictures."""
+"""What only SAPIEN has: its linkage, dry friction, rebuilt physics, and a probe for images."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sart_toolkit.workers import worker_map
 
 pytest.importorskip("sapien")
 
-from sart_toolkit.backends import sapien_pictures
+from sart_toolkit.backends import sapien_renderer
 from sart_toolkit.backends.sapien import SapienBackend
 
 ROBOTS = ("ur5e_2f85", "ur5e_hande")
@@ -405,7 +405,7 @@ def test_contacts_name_held_bodies_and_links_that_are_fixed_to_others():
     backend.close()
 
 
-# --- pictures -----------------------------------------------------------------------------------
+# --- images -----------------------------------------------------------------------------------
 
 
 def _looking_down(*bodies: Body, light: Light) -> SapienBackend:
@@ -419,7 +419,7 @@ def _looking_down(*bodies: Body, light: Light) -> SapienBackend:
 
 @pytest.fixture
 def draws():
-    reason = sapien_pictures.why_no_pictures()
+    reason = sapien_renderer.why_no_images()
     if reason:
         pytest.skip(f"SAPIEN can't draw here: {reason}")
 
@@ -431,7 +431,7 @@ def test_a_face_shows_its_colour_as_the_light_has_it_and_less_in_shadow(draws):
     post = Body("post", (Shape("box", (0.1, 0.1, 0.2), pose([-1.5, 0, 0.4])),))
     backend = _looking_down(floor, post, light=light)
     rgb = backend.observe(("above",)).cameras["above"].rgb
-    # The post's shadow falls 0.3 to 0.5 m towards -x, which is left in the picture.
+    # The post's shadow falls 0.3 to 0.5 m towards -x, which is left in the image.
     lit = 255 * colour * (0.4 + 0.5 * np.cos(np.pi / 4))
     np.testing.assert_allclose(rgb[32, 60], lit, atol=1)
     np.testing.assert_allclose(rgb[32, 9], 255 * colour * 0.4, atol=1)
@@ -446,7 +446,7 @@ from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.spec import SceneSpec
 robot = get_robot("ur5e_hande")
 backend = make_backend("sapien", robot, SceneSpec(()), 16)
-assert "draw here" in backend.no_pictures and not type(backend).no_pictures
+assert "draw here" in backend.no_images and not type(backend).no_images
 backend.reset(backend.scene.initial_state(robot.home, 0.5))
 backend.command(robot.home + 0.01, 0.5)
 backend.step()
@@ -459,7 +459,7 @@ except MissingCapability as error:
 
 
 @pytest.mark.parametrize("variable", ["VK_DRIVER_FILES", "VK_ICD_FILENAMES"])
-def test_without_a_driver_physics_works_and_a_picture_says_what_is_missing(variable):
+def test_without_a_driver_physics_works_and_an_image_says_what_is_missing(variable):
     environment = {**os.environ, variable: "/no_such_driver.json"}
     strict = ["-W", "error", "-W", "ignore:Failed to find system libvulkan"]
     words = [sys.executable, *strict, "-c", _WITHOUT_DRIVER]
@@ -476,14 +476,14 @@ def test_the_probe_runs_once_for_all_processes_until_drivers_change_or_its_time_
 ):
     probes = []
     monkeypatch.setenv("SART_CACHE", str(tmp_path))
-    monkeypatch.setattr(sapien_pictures, "_probe", lambda: probes.append(1) or reason)
+    monkeypatch.setattr(sapien_renderer, "_probe", lambda: probes.append(1) or reason)
 
     def as_another_process(change=None):
         for path in tmp_path.glob("*/sapien-*.json"):
             if change:
                 path.write_text(change(path.read_text()))
-        sapien_pictures._why_no_pictures.cache_clear()
-        return sapien_pictures.why_no_pictures()
+        sapien_renderer._why_no_images.cache_clear()
+        return sapien_renderer.why_no_images()
 
     def older(by):
         return lambda text: json.dumps({**json.loads(text), "time": json.loads(text)["time"] - by})
@@ -499,22 +499,22 @@ def test_the_probe_runs_once_for_all_processes_until_drivers_change_or_its_time_
         as_another_process()
         assert len(probes) == 4
     finally:
-        sapien_pictures._why_no_pictures.cache_clear()
+        sapien_renderer._why_no_images.cache_clear()
 
 
 @pytest.mark.parametrize(
     ("program", "reason"),
     [
         ("import os; os.abort()", "its process ended with -6"),
-        ("import time; time.sleep(60)", "no picture within 0.5 s"),
+        ("import time; time.sleep(60)", "no image within 0.5 s"),
         ("raise RuntimeError('no device')", "RuntimeError: no device"),
         ("", ""),
     ],
 )
 def test_a_driver_that_crashes_or_hangs_is_a_reason_not_a_crash(monkeypatch, program, reason):
-    monkeypatch.setattr(sapien_pictures, "_PROBE", program)
-    monkeypatch.setattr(sapien_pictures, "_PROBE_SECONDS", 0.5 if "sleep" in program else 30)
-    assert sapien_pictures._probe() == reason
+    monkeypatch.setattr(sapien_renderer, "_PROBE", program)
+    monkeypatch.setattr(sapien_renderer, "_PROBE_SECONDS", 0.5 if "sleep" in program else 30)
+    assert sapien_renderer._probe() == reason
 
 
 def test_a_device_that_is_gone_since_the_probe_is_named(monkeypatch):
@@ -522,8 +522,8 @@ def test_a_device_that_is_gone_since_the_probe_is_named(monkeypatch):
         raise RuntimeError("no device")
 
     backend = SapienBackend(get_robot("ur5e_hande"), SceneSpec(()), 16)
-    monkeypatch.setattr(backend, "no_pictures", "")
-    monkeypatch.setattr(sapien_pictures.sapien.render, "RenderSystem", gone)
+    monkeypatch.setattr(backend, "no_images", "")
+    monkeypatch.setattr(sapien_renderer.sapien.render, "RenderSystem", gone)
     with pytest.raises(MissingCapability, match=r"can't draw here \(no device\); install Mesa"):
         backend.observe(("wrist",))
     backend.close()
@@ -532,10 +532,10 @@ def test_a_device_that_is_gone_since_the_probe_is_named(monkeypatch):
 def test_shaders_that_cannot_be_kept_are_an_error_that_says_where(monkeypatch, tmp_path):
     (tmp_path / "sart_toolkit").write_text("a file, not a folder")
     monkeypatch.setenv("SART_CACHE", str(tmp_path))
-    sapien_pictures._shader_folder.cache_clear()
+    sapien_renderer._shader_folder.cache_clear()
     with pytest.raises(CannotWrite, match="set SART_CACHE"):
-        sapien_pictures._shader_folder()
-    sapien_pictures._shader_folder.cache_clear()
+        sapien_renderer._shader_folder()
+    sapien_renderer._shader_folder.cache_clear()
 
 
 class _Worker:
@@ -546,7 +546,7 @@ class _Worker:
         robot = self.backend.robot
         self.backend.reset(self.backend.scene.initial_state(robot.home, gripper))
         self.backend.step()
-        cameras = ("wrist",) if not self.backend.no_pictures else ()
+        cameras = ("wrist",) if not self.backend.no_images else ()
         return float(self.backend.observe(cameras).gripper)
 
     def close(self) -> None:

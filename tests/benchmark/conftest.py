@@ -1,4 +1,4 @@
-"""Tasks on a backend with tiny pictures."""
+"""Tasks on a backend with tiny images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sart_toolkit.tasks.task import Task
 
 @pytest.fixture(scope="session")
 def make_cell() -> Callable[..., Cell]:
-    """A task on a backend, by default PyBullet, its pictures tiny."""
+    """A task on a backend, by default PyBullet, its images tiny."""
 
     def make(task: Task, backend: str = "pybullet") -> Cell:
         robot = get_robot(task.robot)

@@ -1,4 +1,4 @@
-"""The comparison of radii from pictures and from the scene counts what it finds."""
+"""The comparison of radii from images and from the scene counts what it finds."""
 
 import functools
 

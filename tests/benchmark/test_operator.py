@@ -48,7 +48,7 @@ def test_successes_are_counted_over_random_placements(peg_cell, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["out.json"]
 
 
-def test_failures_are_told_with_placement_and_reason(make_cell, tmp_path):
+def test_failures_are_reported_with_placement_and_reason(make_cell, tmp_path):
     for task, reason in ((LazyPeg(), "above the rim"), (FarPeg(), "nowhere to start")):
         result = benchmark_operator(
             [make_cell(task)], BenchmarkConfig(2), tmp_path / f"{type(task).__name__}.json"

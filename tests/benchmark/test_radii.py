@@ -1,4 +1,4 @@
-"""The benchmark of radii counts honestly, goes on, and finds radii that are too large."""
+"""The benchmark of radii counts honestly, resumes, and finds radii that are too large."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark of segments counts honestly, goes on, and finds faults that are planted."""
+"""The benchmark of segments counts honestly, resumes, and finds faults that are planted."""
 
 from __future__ import annotations
 
@@ -133,17 +133,17 @@ def test_contacts_and_paths_that_were_left_are_told_apart_from_other_rejections(
     assert [sphere["rejections"] for sphere in row["spheres"]] == [{o: 1} for o in outcomes]
 
 
-def test_a_law_that_heeds_no_limits_is_found(
+def test_a_timing_that_ignores_limits_is_found(
     tmp_path: Path, peg_cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    law = timing._law
+    original = timing._timing
 
     def hasty(path: Any, spec: RobotSpec, duration: float) -> Any:
         names = ("velocity_limits", "acceleration_limits", "jerk_limits")
         loose = {name: 1e6 * getattr(spec, name) for name in names}
-        return law(path, dataclasses.replace(spec, **loose), 0.1 * duration)
+        return original(path, dataclasses.replace(spec, **loose), 0.1 * duration)
 
-    monkeypatch.setattr(timing, "_law", hasty)
+    monkeypatch.setattr(timing, "_timing", hasty)
     result = benchmark_segments([peg_cell], SegmentsConfig(1), tmp_path / "out.json")
     row = result["cells"][PEG]
     assert row["limits"]["motions_that_violate"] == 1 == len(row["alarms"])

@@ -113,7 +113,7 @@ def test_from_a_pipe_the_first_word_that_cannot_be_done_is_an_error(refused, dem
         assert message in refused(demo, "--text", words=words)
 
 
-def test_at_a_terminal_mistakes_are_told_and_ctrl_c_keeps_the_work(demo, wait_until):
+def test_at_a_terminal_mistakes_are_reported_and_ctrl_c_keeps_the_work(demo, wait_until):
     here, there = pty.openpty()
     process = subprocess.Popen(
         [*SART, str(demo), "--text"], stdin=there, stdout=there, stderr=there, close_fds=True
@@ -147,7 +147,7 @@ def test_at_a_terminal_mistakes_are_told_and_ctrl_c_keeps_the_work(demo, wait_un
     assert demo.with_name("demo.annotation.json.journal").exists()
 
 
-def test_headless_nothing_is_replaced_unless_told(annotate, refused, demo):
+def test_headless_nothing_is_replaced_unless_asked_for(annotate, refused, demo):
     headless = (demo, "--suggest-all", "--no-window")
     annotate(*headless)
     assert "already exists; add --overwrite" in refused(*headless)
@@ -158,7 +158,7 @@ def test_headless_nothing_is_replaced_unless_told(annotate, refused, demo):
     assert not demo.with_name("demo.annotation.json.journal").exists()
 
 
-def test_without_a_display_the_headless_way_is_told(refused, demo, monkeypatch):
+def test_without_a_display_the_headless_way_is_reported(refused, demo, monkeypatch):
     pytest.importorskip("open3d")
     monkeypatch.delenv("DISPLAY", raising=False)
     line = refused(demo)
@@ -183,19 +183,19 @@ def test_wrong_input_is_one_line_and_leaves_nothing(refused, demo, tmp_path, peg
     save_annotation(out, type(peg_annotation)(peg_annotation.spheres, "0" * 64, settings={}))
     before = out.read_bytes()
     line = refused(demo, "--text", "--out", out)
-    assert "another demonstration" in line and "begin anew with --overwrite" in line
+    assert "another demonstration" in line and "start again with --overwrite" in line
     assert out.read_bytes() == before
     assert sorted(os.listdir(tmp_path)) == ["demo.h5", "other.json"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_an_unwritable_place_is_told_before_anything_is_asked(refused, demo, tmp_path):
+def test_an_unwritable_place_is_reported_before_anything_is_asked(refused, demo, tmp_path):
     place = tmp_path / "place"
     place.mkdir(mode=0o500)
     assert "permission denied" in refused(demo, "--text", "--out", place / "a.json")
 
 
-def test_spheres_can_be_annotated_from_the_recorded_pictures_alone(annotate, demo):
+def test_spheres_can_be_annotated_from_the_recorded_images_alone(annotate, demo):
     result, said = annotate(demo, "--text", "--source", "cloud", words="suggest save quit")
     assert "peg / cloud" in said and result["saved"]
 

@@ -59,7 +59,7 @@ def _short_rollouts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_short_rollouts")
-def test_whole_run_leaves_every_result_and_goes_on_where_it_was(
+def test_whole_run_leaves_every_result_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -159,7 +159,7 @@ def test_validate_proves_a_dataset_again_and_names_what_does_not_hold(
     assert "generation was interrupted" in error(capsys, "validate", broken)
 
 
-def test_radii_are_suggested_from_the_recorded_pictures_alone(
+def test_radii_are_suggested_from_the_recorded_images_alone(
     chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["suggest", chain / "demo.h5", "--source", "cloud"]
@@ -318,7 +318,7 @@ def test_a_demonstration_that_fails_is_not_saved(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_several_cameras_and_rectangular_pictures_are_recorded(
+def test_several_cameras_and_rectangular_images_are_recorded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["record", "peg_in_hole", "--out", tmp_path / "d.h5", "--image-size", "48x32"]
@@ -336,7 +336,7 @@ def test_placement_can_be_random(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert placement["x"] != 0.0 and abs(placement["x"]) <= 0.05
 
 
-def test_yaw_and_looks_vary_only_where_asked_for(
+def test_yaw_and_appearance_vary_only_where_asked_for(
     chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["record", "peg_in_hole", "--image-size", 32, "--out"]
@@ -346,11 +346,11 @@ def test_yaw_and_looks_vary_only_where_asked_for(
     assert "can be turned by 0 to" in error(
         capsys, *argv, tmp_path / "c.h5", "--placement", "random", "--yaw-deg", 90
     )
-    run(capsys, *argv, tmp_path / "d.h5", "--vary-looks")
+    run(capsys, *argv, tmp_path / "d.h5", "--vary-appearance")
     plain, varied = (load_demonstration(p) for p in (chain / "demo.h5", tmp_path / "d.h5"))
     assert (plain.raw_commands == varied.raw_commands).all()
-    pictures = [d.steps.cameras["wrist"].rgb[0].astype(int) for d in (plain, varied)]
-    assert abs(pictures[0] - pictures[1]).mean() > 2
+    images = [d.steps.cameras["wrist"].rgb[0].astype(int) for d in (plain, varied)]
+    assert abs(images[0] - images[1]).mean() > 2
 
 
 def test_the_operator_benchmark_prints_a_rate_for_each_task_and_backend(

@@ -73,7 +73,9 @@ RECORD = ["record", "peg_in_hole", "--image-size", "32", "--out"]
 BY_HAND = ["--device", "keyboard"]
 
 
-def test_without_a_display_the_remedy_is_told_and_nothing_written(tmp_path, capsys, monkeypatch):
+def test_without_a_display_the_remedy_is_reported_and_nothing_written(
+    tmp_path, capsys, monkeypatch
+):
     pytest.importorskip("pygame")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
@@ -104,18 +106,18 @@ def test_a_discarded_recording_writes_nothing_and_says_so(tmp_path, capsys, dumm
 
 def test_a_disk_that_is_full_at_first_costs_nothing(tmp_path, capsys, dummy, monkeypatch):
     monkeypatch.setattr("sart_toolkit.record.window._SAVED_SHOWN", 0.0)
-    tries = []
+    attempts = []
 
     def save(path, demonstration):
-        tries.append(path)
-        if len(tries) == 1:
+        attempts.append(path)
+        if len(attempts) == 1:
             raise CannotWrite(f"{path}: No space left on device; nothing was replaced")
         save_demonstration(path, demonstration)
 
     monkeypatch.setattr("sart_toolkit.cli.teleop.save_demonstration", save)
     dummy("right", "right", "right", "right", "right", "right")
     result(capsys, *RECORD, tmp_path / "d.h5", *BY_HAND)
-    assert len(tries) == 2 and len(load_demonstration(tmp_path / "d.h5")) == 2
+    assert len(attempts) == 2 and len(load_demonstration(tmp_path / "d.h5")) == 2
 
 
 def test_what_is_there_is_refused_before_the_window_opens(demo, tmp_path, capsys, dummy):
@@ -146,9 +148,9 @@ def test_what_can_t_be_steered_with_is_one_line(tmp_path, capsys, dummy, options
 def test_a_backend_that_draws_nothing_can_t_be_steered_by_hand(
     tmp_path, capsys, dummy, monkeypatch
 ):
-    monkeypatch.setattr(PyBulletBackend, "no_pictures", "it has no eyes")
+    monkeypatch.setattr(PyBulletBackend, "no_images", "it has no eyes")
     said = error(capsys, *RECORD, tmp_path / "d.h5", *BY_HAND)
-    assert "backend 'pybullet' takes no pictures: it has no eyes" in said
+    assert "backend 'pybullet' takes no images: it has no eyes" in said
 
 
 @pytest.mark.window

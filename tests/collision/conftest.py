@@ -41,7 +41,7 @@ def start(peg_task: Task, peg_model: RobotModel) -> Start:
 
 @pytest.fixture(scope="session")
 def recorded() -> Callable[[str], Demonstration]:
-    """A demonstration of a task by its scripted operator, without wrist pictures worth the name."""
+    """A demonstration of a task by its scripted operator, without wrist images worth the name."""
 
     @functools.cache
     def recorded(name: str) -> Demonstration:

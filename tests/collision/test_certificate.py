@@ -74,12 +74,12 @@ def rods():
     collision = CollisionModel(get_robot("ur5e_2f85"), SceneSpec(bodies))
     names = {part.body for part in collision.placed(dict.fromkeys(shapes, np.eye(4)), 0.0).parts}
 
-    def place(carried, T_tool_carried, standing, T_world_standing):
-        """Only these two are looked at, or, where they are one, nothing."""
-        pair = {carried, standing}
+    def place(grasped, T_tool_grasped, standing, T_world_standing):
+        """Only these two are considered, or, where they are one, nothing."""
+        pair = {grasped, standing}
         allowed = [(a, b) for a in names for b in names if {a, b} != pair or len(pair) == 1]
         Ts = {**dict.fromkeys(shapes, np.eye(4)), standing: T_world_standing}
-        return collision.placed(Ts, 0.0, {carried: T_tool_carried}, allowed)
+        return collision.placed(Ts, 0.0, {grasped: T_tool_grasped}, allowed)
 
     return place
 
@@ -319,11 +319,11 @@ def test_a_rod_that_is_passed_by_a_hair_is_no_collision(crossing, s, above):
 def test_hardly_any_path_is_rejected_that_keeps_a_millimetre_more_than_is_asked_for(
     cluttered, pybullet
 ):
-    rng, tried, refused = np.random.default_rng(5), 0, 0
-    while tried < 200:
-        kind = list(cluttered)[tried % 4]
+    rng, attempted, refused = np.random.default_rng(5), 0, 0
+    while attempted < 200:
+        kind = list(cluttered)[attempted % 4]
         placed = cluttered[kind]
-        path = random_path(placed, rng, sorted(PATHS)[tried % 2], 0.3, 0.05)
+        path = random_path(placed, rng, sorted(PATHS)[attempted % 2], 0.3, 0.05)
         _, nearest = pybullet[kind].nearest_along(path.positions(DENSE[::8]), 0.02)
         # Wrist 1 and wrist 3, which PyBullet doesn't compare, are 18 mm apart.
         clearance = min(nearest.distance, 0.018)
@@ -331,7 +331,7 @@ def test_hardly_any_path_is_rejected_that_keeps_a_millimetre_more_than_is_asked_
             continue
         margin = clearance - 0.001 - TOO_FAR
         certificate = certify(placed, path, max(margin, 0.0))
-        tried += 1
+        attempted += 1
         # Between samples the path may be nearer than it seemed, as a collision then shows.
         refused += certificate.verdict == "undecided"
         if certificate.verdict == "collision":
@@ -424,8 +424,8 @@ def test_where_there_is_nothing_to_hit_all_is_free(rods):
     certificate.check_free()
 
 
-@pytest.mark.parametrize("play", [0.0, 0.003])
-def test_what_is_carried_is_proved_clear_by_its_play_and_the_margin(play):
+@pytest.mark.parametrize("slip", [0.0, 0.003])
+def test_what_is_grasped_is_proved_clear_by_its_slip_and_the_margin(slip):
     box, table = Shape("box", (0.1, 0.1, 0.1)), Shape("box", (4, 4, 0.1))
     bodies = (Body("box", (box,), mass=0.1), Body("table", (table,)))
     collision = CollisionModel(get_robot("ur5e_2f85"), SceneSpec(bodies))
@@ -436,11 +436,11 @@ def test_what_is_carried_is_proved_clear_by_its_play_and_the_margin(play):
     T_world_table = pose([0, 0, lowest - 0.05 - 0.004])
     placed = collision.placed(
         {"table": T_world_table}, 0.0, {"box": T_tool_box},
-        [("base_link_inertia", "table"), *((part, "table") for part in ARM)], play,
+        [("base_link_inertia", "table"), *((part, "table") for part in ARM)], slip,
     )  # fmt: skip
     path = PolylinePath([q, q + [0, 0, 0, 0, 0, 1.0]])
-    assert certify(placed, path, 0.004 - play - 2e-4).verdict == "free"
-    assert certify(placed, path, 0.004 - play + 2e-4).verdict == "collision"
+    assert certify(placed, path, 0.004 - slip - 2e-4).verdict == "free"
+    assert certify(placed, path, 0.004 - slip + 2e-4).verdict == "collision"
 
 
 # --- margin and effort --------------------------------------------------------------------------

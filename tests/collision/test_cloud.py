@@ -1,6 +1,6 @@
 """Clouds: on the scene, never on the robot, forgetful of what moved; distances that miss no point.
 
-The synthetic pictures show boxes over a floor, cast ray by ray, and no robot.
+The synthetic images show boxes over a floor, cast ray by ray, and no robot.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ def recorded(peg_demonstration, peg_task, robot):
 
 
 @pytest.fixture(scope="module")
-def pictured(peg_demonstration):
+def rendered(peg_demonstration):
     """Makes demonstrations whose depth shows a floor and, at each waypoint, boxes at poses.
 
     `Ts` are the tool's poses where they aren't those of peg-in-hole, straight down.
     """
 
-    def pictured(boxes_at, size=48, Ts=None):
+    def rendered(boxes_at, size=48, Ts=None):
         steps = peg_demonstration.steps
         if Ts is not None:
             steps = dataclasses.replace(steps, measured_Ts_world_tool=Ts)
@@ -84,7 +84,7 @@ def pictured(peg_demonstration):
             peg_demonstration, steps=dataclasses.replace(steps, cameras={"wrist": camera})
         )
 
-    return pictured
+    return rendered
 
 
 def cast(T_box_camera, rays):
@@ -148,19 +148,19 @@ def test_no_cell_of_the_grid_holds_two_seen_points(recorded):
     assert len(np.unique(cells, axis=0)) == len(cells)
 
 
-def test_what_stays_is_in_the_cloud_and_what_left_is_not(pictured, robot):
+def test_what_stays_is_in_the_cloud_and_what_left_is_not(rendered, robot):
     def still(cloud):
         return on_box(seen(cloud), BOX).sum()
 
-    stays = fuse_cloud(pictured(lambda t: [BOX]), robot, ())
-    leaves = pictured(lambda t: [BOX] if t < 15 else [])
+    stays = fuse_cloud(rendered(lambda t: [BOX]), robot, ())
+    leaves = rendered(lambda t: [BOX] if t < 15 else [])
     assert still(stays) > 30
     assert still(fuse_cloud(leaves, robot, ())) == 0
     assert still(fuse_cloud(leaves, robot, (), range(15))) > 30
 
 
-def test_a_later_picture_does_not_take_away_the_edges_of_what_stays(pictured, robot, way_down):
-    demonstration = pictured(lambda t: [BOX], 96, from_two_sides(way_down))
+def test_a_later_image_does_not_take_away_the_edges_of_what_stays(rendered, robot, way_down):
+    demonstration = rendered(lambda t: [BOX], 96, from_two_sides(way_down))
     free = CloudConfig(unknown="free")
     both = seen(fuse_cloud(demonstration, robot, (), [0, 1], free))
     one = seen(fuse_cloud(demonstration, robot, (), [0], free))
@@ -168,13 +168,13 @@ def test_a_later_picture_does_not_take_away_the_edges_of_what_stays(pictured, ro
     assert cKDTree(both).query(on_it)[0].max() < 0.004
 
 
-def test_what_comes_later_is_in_the_cloud(pictured, robot):
-    comes = pictured(lambda t: [BOX] if t >= 15 else [])
+def test_what_comes_later_is_in_the_cloud(rendered, robot):
+    comes = rendered(lambda t: [BOX] if t >= 15 else [])
     assert on_box(seen(fuse_cloud(comes, robot, ())), BOX).sum() > 30
 
 
-def test_a_noisy_pixel_that_other_pictures_look_through_is_dropped(pictured, robot):
-    demonstration = pictured(lambda t: [])
+def test_a_noisy_pixel_that_other_images_see_through_is_dropped(rendered, robot):
+    demonstration = rendered(lambda t: [])
     camera = demonstration.steps.cameras["wrist"]
     depth = np.array(camera.depth)
     depth[0, 10:14, 20:24] -= 0.1
@@ -191,8 +191,8 @@ def with_depth(demonstration, depth):
     )
 
 
-def test_a_depth_that_is_no_number_counts_as_nothing(pictured, robot):
-    demonstration = pictured(lambda t: [BOX])
+def test_a_depth_that_is_no_number_counts_as_nothing(rendered, robot):
+    demonstration = rendered(lambda t: [BOX])
     depth = np.array(demonstration.steps.cameras["wrist"].depth)
     depth[:, :10], depth[:, 10:20], depth[:, 20:24] = np.nan, np.inf, -1.0
     holes = np.array(depth)
@@ -202,8 +202,8 @@ def test_a_depth_that_is_no_number_counts_as_nothing(pictured, robot):
     assert a.points.tobytes() == b.points.tobytes()
 
 
-def test_points_are_within_depth_range_and_reach(pictured, robot):
-    demonstration = pictured(lambda t: [BOX])
+def test_points_are_within_depth_range_and_reach(rendered, robot):
+    demonstration = rendered(lambda t: [BOX])
     config = CloudConfig(far=0.45, reach=0.25, unknown="free")
     cloud = fuse_cloud(demonstration, robot, (), config=config)
     steps = demonstration.steps
@@ -216,12 +216,12 @@ def test_points_are_within_depth_range_and_reach(pictured, robot):
     assert len(cloud) < len(fuse_cloud(demonstration, robot, (), config=CloudConfig()))
 
 
-def test_the_robots_own_pixels_are_dropped_wherever_it_is(pictured, robot, peg_task):
+def test_the_robots_own_pixels_are_dropped_wherever_it_is(rendered, robot, peg_task):
     def peg_at(t):
         return [Ts[t] @ pose([0, 0, 0.03])]
 
-    Ts = pictured(lambda t: []).steps.measured_Ts_world_tool
-    demonstration = pictured(peg_at)
+    Ts = rendered(lambda t: []).steps.measured_Ts_world_tool
+    demonstration = rendered(peg_at)
     # What is drawn in the peg's place is up to 15 mm larger than it.
     bare = fuse_cloud(demonstration, robot, (), [0], CloudConfig(self_margin=0.001))
     held = fuse_cloud(demonstration, robot, peg_task.scene.held, [0], CloudConfig(self_margin=0.02))
@@ -232,8 +232,8 @@ def test_the_robots_own_pixels_are_dropped_wherever_it_is(pictured, robot, peg_t
 # --- unknown space ------------------------------------------------------------------------------
 
 
-def test_space_behind_a_surface_is_filled_to_the_depth_asked(pictured, robot):
-    demonstration = pictured(lambda t: [BOX])
+def test_space_behind_a_surface_is_filled_to_the_depth_asked(rendered, robot):
+    demonstration = rendered(lambda t: [BOX])
     cloud = fuse_cloud(demonstration, robot, (), config=CloudConfig(behind=0.02))
     filled = cloud.points[cloud.behind]
     assert len(filled) > 100
@@ -251,8 +251,8 @@ def from_two_sides(Ts):
     return np.stack([about @ T if t % 2 else T for t, T in enumerate(Ts)])
 
 
-def test_nothing_is_filled_in_where_another_picture_looks_through(pictured, robot, way_down):
-    demonstration = pictured(lambda t: [BOX], 96, from_two_sides(way_down))
+def test_nothing_is_filled_in_where_another_image_sees_through(rendered, robot, way_down):
+    demonstration = rendered(lambda t: [BOX], 96, from_two_sides(way_down))
 
     def shadow(waypoints):
         """Cells filled in under the box, farther from it and the floor than depths are trusted."""
@@ -263,14 +263,14 @@ def test_nothing_is_filled_in_where_another_picture_looks_through(pictured, robo
 
     one, both = shadow([0]), shadow([0, 1])
     assert len(one) > 500
-    # From its side the other picture sees about half of the space under the box.
+    # From its side the other image sees about half of the space under the box.
     assert len(one & both) < 0.7 * len(one)
 
 
-def test_nothing_is_filled_in_where_the_robot_itself_was(pictured, robot, peg_task, way_down):
+def test_nothing_is_filled_in_where_the_robot_itself_was(rendered, robot, peg_task, way_down):
     T_peg = way_down[-1] @ pose([0, 0, 0.02])
-    demonstration = pictured(lambda t: [T_peg] if t == 0 else [])
-    # The last picture tells nothing but where the robot was.
+    demonstration = rendered(lambda t: [T_peg] if t == 0 else [])
+    # The last image tells nothing but where the robot was.
     depth = np.array(demonstration.steps.cameras["wrist"].depth)
     depth[-1] = 0.0
     demonstration = with_depth(demonstration, depth)
@@ -284,14 +284,14 @@ def test_nothing_is_filled_in_where_the_robot_itself_was(pictured, robot, peg_ta
     assert in_peg([0, len(demonstration) - 1]) == 0
 
 
-# --- what is carried ----------------------------------------------------------------------------
+# --- what is grasped ----------------------------------------------------------------------------
 
 
 T_TOOL_BOX = pose([0.01, -0.03, 0.10])
 
 
 @pytest.fixture(scope="module", params=["down", "up", "along"])
-def carrying(request, pictured, way_down):
+def grasping(request, rendered, way_down):
     """A box that stands until waypoint 12 and then goes with the tool, down, up or sideways."""
     Ts = np.array(way_down)
     if request.param == "up":
@@ -299,12 +299,12 @@ def carrying(request, pictured, way_down):
     if request.param == "along":
         # The floor is near enough to be taken for a part of the box.
         Ts[:, :3, 3] = [0.5, 0, FLOOR + 0.14] + 0.004 * np.arange(len(Ts))[:, None] * [0, 1, 0]
-    return pictured(lambda t: [Ts[max(t, 12)] @ T_TOOL_BOX], Ts=Ts)
+    return rendered(lambda t: [Ts[max(t, 12)] @ T_TOOL_BOX], Ts=Ts)
 
 
 @pytest.mark.parametrize("before", [range(12), None], ids=["seen before", "held from the start"])
-def test_what_was_carried_is_found_in_the_tool_frame(carrying, robot, before):
-    demonstration = carrying
+def test_what_was_grasped_is_found_in_the_tool_frame(grasping, robot, before):
+    demonstration = grasping
     config = CloudConfig(unknown="free")
     found = grasped_object(demonstration, robot, (), range(12, len(demonstration)), before, config)
     assert len(found.points) > 30
@@ -313,8 +313,8 @@ def test_what_was_carried_is_found_in_the_tool_frame(carrying, robot, before):
     assert np.ptp(found.points[:, 0]) > SIZE[0] - 0.012
 
 
-def test_an_object_held_from_the_start_is_taken_to_be_as_deep_as_the_unknown(carrying, robot):
-    demonstration = carrying
+def test_an_object_held_from_the_start_is_taken_to_be_as_deep_as_the_unknown(grasping, robot):
+    demonstration = grasping
     after = range(12, len(demonstration))
     visible = grasped_object(demonstration, robot, (), after, config=CloudConfig(unknown="free"))
     deep = grasped_object(demonstration, robot, (), after)
@@ -326,24 +326,22 @@ def test_an_object_held_from_the_start_is_taken_to_be_as_deep_as_the_unknown(car
     np.testing.assert_allclose(shift[:, 2], 0, atol=1e-12)
 
 
-def test_what_was_taken_out_of_sight_is_found_where_pictures_look_through(
-    pictured, robot, way_down
-):
+def test_what_was_taken_out_of_sight_is_found_where_images_see_through(rendered, robot, way_down):
     T_box = way_down[12] @ T_TOOL_BOX
-    taken = pictured(lambda t: [T_box] if t < 12 else [])
+    taken = rendered(lambda t: [T_box] if t < 12 else [])
     found = grasped_object(taken, robot, (), range(12, len(taken)), range(12))
     assert len(found.points) > 30
     assert on_box(found.points, T_TOOL_BOX).all()
 
 
-def test_nothing_is_carried_where_all_stays_or_the_tool_does_not_move(pictured, carrying, robot):
-    still = pictured(lambda t: [BOX])
+def test_nothing_is_grasped_where_all_stays_or_the_tool_does_not_move(rendered, grasping, robot):
+    still = rendered(lambda t: [BOX])
     assert grasped_object(still, robot, (), range(12, len(still)), range(12)) is None
-    assert grasped_object(carrying, robot, (), range(12, 13), range(12)) is None
+    assert grasped_object(grasping, robot, (), range(12, 13), range(12)) is None
 
 
-def test_what_was_carried_is_no_part_of_the_scene_before_or_after(carrying, robot):
-    demonstration = carrying
+def test_what_was_grasped_is_no_part_of_the_scene_before_or_after(grasping, robot):
+    demonstration = grasping
     n = len(demonstration)
     found = grasped_object(demonstration, robot, (), range(12, n), range(12))
     cloud = fuse_cloud(demonstration, robot, (), grasped=[found])
@@ -455,7 +453,7 @@ def test_a_points_error_is_its_distance_to_the_nearest_surface(kind, size, p, er
 # --- errors -------------------------------------------------------------------------------------
 
 
-def test_a_body_without_a_pose_is_told(recorded, peg_task):
+def test_a_body_without_a_pose_is_reported(recorded, peg_task):
     with pytest.raises(UnknownName, match="unknown body 'table'"):
         surface_errors(recorded, peg_task.scene, {"block": np.eye(4)})
 
@@ -473,7 +471,7 @@ def test_a_demonstration_without_depth_is_refused(peg_demonstration, robot):
         fuse_cloud(with_depth(peg_demonstration, depth), robot, ())
 
 
-def test_pictures_of_nothing_near_are_refused(peg_demonstration, peg_task, robot):
+def test_images_of_nothing_near_are_refused(peg_demonstration, peg_task, robot):
     held = peg_task.scene.held
     with pytest.raises(InvalidInput, match="within 0.01 m of the tool .* got nothing; look at"):
         fuse_cloud(peg_demonstration, robot, held, config=CloudConfig(reach=0.01))

@@ -129,7 +129,7 @@ def test_rough_distances_from_the_cloud_are_never_above_true_ones(worlds, seed, 
 def test_witnesses_and_gradients_are_those_of_the_nearest_ball(worlds, rng):
     cloud, step = worlds[0].cloud, 1e-5
     pairs = [k for k in range(len(cloud.pairs)) if cloud.names(k)[1] == CLOUD]
-    looked_at = 0
+    checked = 0
     for _ in range(10):
         q = cloud.kinematics.spec.home + rng.uniform(-0.6, 0.6, 6)
         k = pairs[int(np.argmin(cloud.pair_distances(q, pairs)))]
@@ -145,8 +145,8 @@ def test_witnesses_and_gradients_are_those_of_the_nearest_ball(worlds, rng):
             continue
         slopes = [(cloud.pair_distances(q + step * e, [k])[0] - distance) / step for e in np.eye(6)]
         np.testing.assert_allclose(cloud.gradient(q, k), slopes, atol=5e-3)
-        looked_at += 1
-    assert looked_at >= 3
+        checked += 1
+    assert checked >= 3
 
 
 # --- soundness ----------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Radii from recorded pictures alone: never much larger than those from the true scene."""
+"""Radii from recorded images alone: never much larger than those from the true scene."""
 
 import dataclasses
 
@@ -59,11 +59,11 @@ def toolbox():
 
 @pytest.mark.parametrize("name", ["peg", "toolbox"])
 def test_radii_are_no_larger_than_the_exact_ones_by_2_mm_and_mostly_nearly_as_large(name, request):
-    shown = request.getfixturevalue(name)
+    demo = request.getfixturevalue(name)
     ratios = []
-    for sphere in suggest_annotation(shown.demonstration, shown.exact).spheres:
-        exact = suggest_radius(shown.exact, shown.demonstration, sphere.waypoint, FINE)
-        seen = suggest_radius(shown.cloud, shown.demonstration, sphere.waypoint, FINE)
+    for sphere in suggest_annotation(demo.demonstration, demo.exact).spheres:
+        exact = suggest_radius(demo.exact, demo.demonstration, sphere.waypoint, FINE)
+        seen = suggest_radius(demo.cloud, demo.demonstration, sphere.waypoint, FINE)
         assert seen.radius <= exact.radius + 0.002, sphere
         ratios.append(seen.radius / exact.radius)
     assert np.median(ratios) >= 0.5 and ratios[0] > 0.9
@@ -72,8 +72,8 @@ def test_radii_are_no_larger_than_the_exact_ones_by_2_mm_and_mostly_nearly_as_la
 def test_spheres_from_the_cloud_tile_the_demonstration_and_say_what_limits_them(toolbox):
     annotation = suggest_annotation(toolbox.demonstration, toolbox.cloud)
     annotation.check_matches(toolbox.demonstration)
-    carrying = [bool(toolbox.cloud.phases[s.waypoint].grasped) for s in annotation.spheres]
-    assert not carrying[0] and carrying[-1]
+    grasping = [bool(toolbox.cloud.phases[s.waypoint].grasped) for s in annotation.spheres]
+    assert not grasping[0] and grasping[-1]
     reasons = {sphere.limited_by for sphere in annotation.spheres}
     assert any(reason.endswith("/ cloud") for reason in reasons)
     assert any("gripper command" in reason for reason in reasons)
@@ -95,7 +95,7 @@ def test_what_was_lifted_reaches_down_to_where_it_stood(toolbox):
 
 
 def test_where_the_true_bodies_are_makes_no_difference(peg):
-    """Nothing of the simulated scene but what was seen is looked at."""
+    """Nothing of the simulated scene but what was seen is used."""
     far = {k: T @ pose([0, 0, -5]) for k, T in peg.demonstration.body_Ts_world.items()}
     blind = dataclasses.replace(peg.demonstration, body_Ts_world=far)
     elsewhere = CloudWorld(blind, peg.robot, peg.task.scene)

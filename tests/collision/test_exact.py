@@ -20,14 +20,14 @@ from sart_toolkit.tasks import get_task
 
 @pytest.mark.parametrize("when", ["before the grasp", "in the grasp", "at the end"])
 def test_all_bodies_are_where_they_were_seen(picked, when, first_grasp):
-    shown, grasped = picked.demonstration, first_grasp
-    t = {"before the grasp": 5, "in the grasp": grasped + 3, "at the end": len(shown) - 1}[when]
+    demo, grasped = picked.demonstration, first_grasp
+    t = {"before the grasp": 5, "in the grasp": grasped + 3, "at the end": len(demo) - 1}[when]
     placed = picked.placed(t)
-    joints = placed.joint_poses(shown.steps.joint_positions[t])
+    joints = placed.joint_poses(demo.steps.joint_positions[t])
     seen = set()
     for part in placed.parts:
-        if part.body in shown.body_Ts_world:
-            T = shown.body_Ts_world[part.body][t]
+        if part.body in demo.body_Ts_world:
+            T = demo.body_Ts_world[part.body][t]
             local = part.points @ joints[part.joint][:3, :3].T + joints[part.joint][:3, 3]
             local = (local - T[:3, 3]) @ T[:3, :3]
             shapes = next(b.shapes for b in picked.collision.scene.bodies if b.name == part.body)
@@ -40,8 +40,8 @@ def test_all_bodies_are_where_they_were_seen(picked, when, first_grasp):
 def test_what_is_grasped_moves_with_the_tool_and_is_no_obstacle(picked, rng, first_grasp):
     t = first_grasp + 10
     placed, steps = picked.placed(t), picked.demonstration.steps
-    carried = [part for part in placed.parts if part.body == "toolbox"]
-    assert {part.joint for part in carried} == {6}
+    grasped_parts = [part for part in placed.parts if part.body == "toolbox"]
+    assert {part.joint for part in grasped_parts} == {6}
     assert "toolbox" not in {placed.names(k)[1] for k in range(len(placed.pairs))}
     assert ("toolbox", "table") in {placed.names(k) for k in range(len(placed.pairs))}
     T_tool_box = inverse(steps.measured_Ts_world_tool[t])
@@ -101,10 +101,10 @@ def test_what_is_carried_may_move_in_the_grasp_by_its_play(picked, toolbox, firs
     tight = ExactWorld(
         picked.demonstration, get_robot(toolbox.robot), toolbox.scene, slip_tolerance=0.0
     )
-    for scene, play in ((picked, 0.005), (tight, 0.0)):
+    for scene, slip in ((picked, 0.005), (tight, 0.0)):
         placed = scene.placed(t)
-        carried = np.array([placed.names(k)[0] == "toolbox" for k in range(len(placed.pairs))])
-        np.testing.assert_array_equal(placed.slip, play * carried)
+        of_grasped = np.array([placed.names(k)[0] == "toolbox" for k in range(len(placed.pairs))])
+        np.testing.assert_array_equal(placed.slip, slip * of_grasped)
         assert not scene.placed(3).slip.any()
 
 
@@ -115,17 +115,17 @@ def test_a_scene_is_put_together_once_for_each_waypoint(picked):
 
 def test_a_door_is_where_it_was_at_each_waypoint(recorded):
     task = get_task("door_opening")
-    shown = recorded(task.name)
-    scene = ExactWorld(shown, get_robot(task.robot), task.scene)
-    for t in (0, len(shown) - 1):
+    demo = recorded(task.name)
+    scene = ExactWorld(demo, get_robot(task.robot), task.scene)
+    for t in (0, len(demo) - 1):
         parts = [part for part in scene.placed(t).parts if part.body == "door"]
         assert {part.joint for part in parts} == {0}
         shapes = [s for s in task.scene.jointed["door"].shapes if s.collides]
-        T = shown.body_Ts_world["door"][t]
+        T = demo.body_Ts_world["door"][t]
         for part, shape in zip(parts, shapes, strict=True):
             expected = shape.corners() @ T[:3, :3].T + T[:3, 3]
             np.testing.assert_allclose(part.points, expected, atol=1e-9)
-    start, end = (shown.body_Ts_world["door"][t] for t in (0, -1))
+    start, end = (demo.body_Ts_world["door"][t] for t in (0, -1))
     assert np.abs(start - end).max() > 0.1
 
 
@@ -133,9 +133,9 @@ def test_a_door_is_where_it_was_at_each_waypoint(recorded):
 
 
 def test_a_demonstration_that_does_not_tell_where_a_body_was_is_refused(picked, toolbox):
-    shown = picked.demonstration
-    Ts = {name: T for name, T in shown.body_Ts_world.items() if name != "toolbox"}
-    blind = dataclasses.replace(shown, body_Ts_world=Ts)
+    demo = picked.demonstration
+    Ts = {name: T for name, T in demo.body_Ts_world.items() if name != "toolbox"}
+    blind = dataclasses.replace(demo, body_Ts_world=Ts)
     with pytest.raises(
         Mismatch, match="doesn't tell where 'toolbox' was, so nothing can be proved"
     ):
@@ -143,10 +143,10 @@ def test_a_demonstration_that_does_not_tell_where_a_body_was_is_refused(picked, 
 
 
 def test_a_scene_of_which_a_body_does_not_collide_is_refused(picked, toolbox):
-    shown = picked.demonstration
+    demo = picked.demonstration
     ghost = Body("ghost", (Shape("sphere", (0.1,), collides=False),))
     scene = dataclasses.replace(toolbox.scene, bodies=(*toolbox.scene.bodies, ghost))
-    Ts = {**shown.body_Ts_world, "ghost": np.tile(np.eye(4), (len(shown), 1, 1))}
-    told = dataclasses.replace(shown, body_Ts_world=Ts)
+    Ts = {**demo.body_Ts_world, "ghost": np.tile(np.eye(4), (len(demo), 1, 1))}
+    changed = dataclasses.replace(demo, body_Ts_world=Ts)
     with pytest.raises(InvalidInput, match="body 'ghost': no shape of it collides"):
-        ExactWorld(told, get_robot(toolbox.robot), scene)
+        ExactWorld(changed, get_robot(toolbox.robot), scene)

@@ -56,7 +56,7 @@ def by_names(placed):
 
 
 def body_distances(placed, q):
-    """The distance of every two bodies that are looked at."""
+    """The distance of every two bodies that are considered."""
     distances = placed.distances(q)
     return {names: distances[pairs].min() for names, pairs in by_names(placed).items()}
 
@@ -66,7 +66,7 @@ def robot_links(placed):
 
 
 def scene_distance(placed, q, body):
-    """The distance of a link or carried body from the scene."""
+    """The distance of a link or grasped body from the scene."""
     own = robot_links(placed)
     distances = body_distances(placed, q)
     return min(d for (a, b), d in distances.items() if a == body and b not in own)
@@ -459,7 +459,7 @@ def test_no_pair_of_the_robots_own_overlaps_at_home_at_any_opening(robot):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("first", [0.0, 1.0])
-def test_which_pairs_are_looked_at_does_not_depend_on_the_opening(robot, first):
+def test_which_pairs_are_considered_does_not_depend_on_the_opening(robot, first):
     collision = CollisionModel(get_robot(robot), SceneSpec(()))
     collision.placed({}, first)
     names = {collision.placed({}, 0.5).names(k) for k in range(len(collision.placed({}, 0).pairs))}
@@ -512,7 +512,7 @@ def test_tool_clearances_are_the_smallest_of_each_tool_body_to_all_that_stands(c
             assert clearance.distance == pytest.approx(distances[own].min(), abs=ACCURACY)
 
 
-def test_a_tool_folded_onto_the_arm_is_told(probed, start):
+def test_a_tool_folded_onto_the_arm_is_reported(probed, start):
     placed, q = probed(FAR), np.array(start.state.q)
     assert placed.nearest(q).distance > 0.01
     found = []
@@ -524,7 +524,7 @@ def test_a_tool_folded_onto_the_arm_is_told(probed, start):
     assert nearest.b in {"forearm_link", "upper_arm_link", "shoulder_link"}
 
 
-def test_a_tool_at_the_robots_own_foot_is_told(probed):
+def test_a_tool_at_the_robots_own_foot_is_reported(probed):
     # Straight down beside the base.
     q = np.array([0.0, -0.6, 2.7, 0.6, 1.6, 0.0])
     nearest = probed(FAR).nearest(q)
@@ -707,12 +707,12 @@ def test_rough_distances_are_never_above_true_ones(cluttered, seed, kind, spread
 
 
 @PROPERTY
-@given(seed=seeds, carried=st.booleans(), play=st.sampled_from([0.0, 0.02]))
-def test_rough_distances_are_never_above_true_ones_whatever_is_carried(rods, seed, carried, play):
+@given(seed=seeds, grasped=st.booleans(), slip=st.sampled_from([0.0, 0.02]))
+def test_rough_distances_are_never_above_true_ones_whatever_is_grasped(rods, seed, grasped, slip):
     rng = np.random.default_rng(seed)
     Ts = {"wire": random_pose(rng, 0.6), "rod": random_pose(rng, 0.6)}
-    in_grasp = {"rod": random_pose(rng, 0.3)} if carried else None
-    placed = rods.placed(Ts, rng.uniform(), in_grasp, slip_tolerance=play)
+    in_grasp = {"rod": random_pose(rng, 0.3)} if grasped else None
+    placed = rods.placed(Ts, rng.uniform(), in_grasp, slip_tolerance=slip)
     q = joints_near(placed, rng)
     assert_not_above(rough_distances(placed, q), placed.distances(q))
 
@@ -737,25 +737,25 @@ def test_spheres_and_boxes_enclose_what_they_stand_for(cluttered, kind, rng):
         assert (np.abs(local) <= bounds.half[k] + 1e-9).all()
 
 
-# --- play in the grasp --------------------------------------------------------------------------
+# --- slip in the grasp --------------------------------------------------------------------------
 
 
 @PROPERTY
-@given(seed=seeds, play=st.floats(0, 0.02))
-def test_all_that_is_carried_is_nearer_by_its_play_and_nothing_else_is(rods, seed, play):
+@given(seed=seeds, slip=st.floats(0, 0.02))
+def test_all_that_is_grasped_is_nearer_by_its_slip_and_nothing_else_is(rods, seed, slip):
     rng = np.random.default_rng(seed)
     Ts, T_tool_rod = {"wire": random_pose(rng, 0.6)}, random_pose(rng, 0.3)
     tight = rods.placed(Ts, 0.2, {"rod": T_tool_rod})
-    loose = rods.placed(Ts, 0.2, {"rod": T_tool_rod}, slip_tolerance=play)
+    loose = rods.placed(Ts, 0.2, {"rod": T_tool_rod}, slip_tolerance=slip)
     q = joints_near(loose, rng)
-    carried = np.array([loose.names(k)[0] == "rod" for k in range(len(loose.pairs))])
-    assert 0 < carried.sum() < len(carried)
-    expected = tight.distances(q) - play * carried
+    grasped = np.array([loose.names(k)[0] == "rod" for k in range(len(loose.pairs))])
+    assert 0 < grasped.sum() < len(grasped)
+    expected = tight.distances(q) - slip * grasped
     np.testing.assert_allclose(loose.distances(q), expected, rtol=0, atol=ACCURACY)
     every = list(range(len(loose.pairs)))
     np.testing.assert_allclose(loose.pair_distances(q, every), expected, rtol=0, atol=ACCURACY)
     assert loose.nearest(q).distance == pytest.approx(expected.min(), abs=ACCURACY)
-    k = int(np.flatnonzero(carried)[0])
+    k = int(np.flatnonzero(grasped)[0])
     assert loose.witness(q, k).distance == pytest.approx(expected[k], abs=ACCURACY)
     margin = expected.min() + 1e-4
     if margin > 0:
@@ -763,7 +763,7 @@ def test_all_that_is_carried_is_nearer_by_its_play_and_nothing_else_is(rods, see
         assert loose.too_close(q, max(margin - 2e-4, 0.0)) is None or expected.min() < 0
 
 
-def test_rough_distances_take_the_play_into_account():
+def test_rough_distances_take_the_slip_into_account():
     # A pole that points at the middle of a block: the sphere about it is hardly nearer.
     collision = simple(
         ("pole", Shape("box", (1e-3, 1e-3, 0.4))), ("block", Shape("box", (1, 1, 1)))
@@ -771,18 +771,18 @@ def test_rough_distances_take_the_play_into_account():
     q = collision.robot.home
     T = collision.kinematics.fk(q)
     Ts = {"block": pose(T[:3, 3] - [0, 0, 0.2 + 0.05 + 0.5])}
-    for play in (0.0, 0.02):
-        placed = collision.placed(Ts, 0.0, {"pole": np.eye(4)}, slip_tolerance=play)
+    for slip in (0.0, 0.02):
+        placed = collision.placed(Ts, 0.0, {"pole": np.eye(4)}, slip_tolerance=slip)
         (k,) = by_names(placed)["pole", "block"]
-        assert placed.distances(q)[k] == pytest.approx(0.05 - play, abs=ACCURACY)
-        assert rough_distances(placed, q)[k] == pytest.approx(0.05 - play, abs=1e-4)
-        assert rough_distances(placed, q)[k] <= 0.05 - play + ACCURACY
+        assert placed.distances(q)[k] == pytest.approx(0.05 - slip, abs=ACCURACY)
+        assert rough_distances(placed, q)[k] == pytest.approx(0.05 - slip, abs=1e-4)
+        assert rough_distances(placed, q)[k] <= 0.05 - slip + ACCURACY
 
 
-@pytest.mark.parametrize("play", [-1e-6, np.nan, np.inf])
-def test_a_play_that_is_negative_or_not_finite_is_refused(rods, play):
+@pytest.mark.parametrize("slip", [-1e-6, np.nan, np.inf])
+def test_a_slip_tolerance_that_is_negative_or_not_finite_is_refused(rods, slip):
     with pytest.raises(InvalidInput, match="slip_tolerance: expected a finite number >= 0 m, got"):
-        rods.placed({"wire": FAR}, 0.0, {"rod": np.eye(4)}, slip_tolerance=play)
+        rods.placed({"wire": FAR}, 0.0, {"rod": np.eye(4)}, slip_tolerance=slip)
 
 
 # --- other questions ----------------------------------------------------------------------------
@@ -888,19 +888,19 @@ def test_a_bare_sphere_is_compared_neither_with_the_robot_nor_with_what_it_carri
 # --- errors -------------------------------------------------------------------------------------
 
 
-def test_a_body_whose_pose_is_missing_is_told(start):
+def test_a_body_whose_pose_is_missing_is_reported(start):
     with pytest.raises(UnknownName, match="unknown body 'block': did you mean 'blok'"):
         start.collision.placed({"table": np.eye(4), "blok": np.eye(4)}, 0.0)
 
 
-def test_a_carried_body_that_the_scene_has_not_is_told(start):
+def test_a_grasped_body_that_the_scene_has_not_is_reported(start):
     Ts = start.state.Ts_world_body
     with pytest.raises(UnknownName, match="unknown grasped body 'blok': did you mean 'block'"):
         start.collision.placed(Ts, 0.0, {"blok": np.eye(4)})
 
 
 @pytest.mark.parametrize("pair", [("peg", "tabel"), ("tabel", "peg")])
-def test_an_allowed_pair_of_what_is_no_body_is_told(start, pair):
+def test_an_allowed_pair_of_what_is_no_body_is_reported(start, pair):
     with pytest.raises(UnknownName, match="unknown body or link 'tabel': did you mean 'table'"):
         start.collision.placed(start.state.Ts_world_body, 0.0, allowed=[pair])
 

@@ -9,8 +9,8 @@ from sart_toolkit.collision.phases import Phase, demonstration_phases
 
 
 def test_phases_tell_approach_grasp_and_lift_apart(picked, first_grasp):
-    phases, shown = picked.phases, picked.demonstration
-    assert len(phases) == len(shown)
+    phases, demo = picked.phases, picked.demonstration
+    assert len(phases) == len(demo)
     changes = [
         (t, before.change(after))
         for t, (before, after) in enumerate(zip(phases[:-1], phases[1:], strict=True))
@@ -22,12 +22,12 @@ def test_phases_tell_approach_grasp_and_lift_apart(picked, first_grasp):
     grasped = first_grasp
     assert all(phase.grasped == {"toolbox"} for phase in phases[grasped:])
     assert all(phase.grasped == frozenset() for phase in phases[:grasped])
-    commands = np.round(shown.steps.commanded_gripper, 2)
+    commands = np.round(demo.steps.commanded_gripper, 2)
     np.testing.assert_array_equal([phase.gripper for phase in phases], commands)
 
 
 def test_what_stands_on_something_else_is_no_contact_of_the_robots(picked, first_grasp):
-    # The toolbox stands on the table; only once it is carried is that a contact.
+    # The toolbox stands on the table; only once it is lifted is that a contact.
     grasped = first_grasp
     assert ("table", "toolbox") in picked.demonstration.touching[grasped - 5]
     assert picked.phases[grasped - 5].contacts == frozenset()
@@ -37,29 +37,31 @@ def test_what_stands_on_something_else_is_no_contact_of_the_robots(picked, first
 
 
 def test_before_the_first_step_all_is_as_after_it_but_for_the_gripper(picked):
-    shown = picked.demonstration
+    demo = picked.demonstration
     touched = (("table", "wrist_camera"),)
-    told = dataclasses.replace(
-        shown, touching=((), touched, *shown.touching[2:]),
+    changed = dataclasses.replace(
+        demo, touching=((), touched, *demo.touching[2:]),
         steps=dataclasses.replace(
-            shown.steps,
-            commanded_gripper=np.concatenate([[0.25], shown.steps.commanded_gripper[1:]]),
+            demo.steps,
+            commanded_gripper=np.concatenate([[0.25], demo.steps.commanded_gripper[1:]]),
         ),
     )  # fmt: skip
-    first, second, *_ = demonstration_phases(told, picked.collision.robot, picked.collision.scene)
+    first, second, *_ = demonstration_phases(
+        changed, picked.collision.robot, picked.collision.scene
+    )
     assert first.contacts == second.contacts == {("table", "wrist_camera")}
-    assert (first.gripper, second.gripper) == (0.25, round(shown.steps.commanded_gripper[1], 2))
+    assert (first.gripper, second.gripper) == (0.25, round(demo.steps.commanded_gripper[1], 2))
 
 
 def test_a_gripper_command_that_is_hardly_another_is_the_same_phase(picked):
-    shown = picked.demonstration
-    command = np.tile([0.301, 0.299], len(shown))[: len(shown)]
-    told = dataclasses.replace(
-        shown,
-        touching=((),) * len(shown),
-        steps=dataclasses.replace(shown.steps, commanded_gripper=command),
+    demo = picked.demonstration
+    command = np.tile([0.301, 0.299], len(demo))[: len(demo)]
+    changed = dataclasses.replace(
+        demo,
+        touching=((),) * len(demo),
+        steps=dataclasses.replace(demo.steps, commanded_gripper=command),
     )
-    phases = demonstration_phases(told, picked.collision.robot, picked.collision.scene)
+    phases = demonstration_phases(changed, picked.collision.robot, picked.collision.scene)
     assert set(phases) == {Phase(0.3, frozenset(), frozenset())}
 
 

@@ -1,4 +1,4 @@
-"""One interface to obstacles, whether they are known from a description or from pictures."""
+"""One interface to obstacles, whether they are known from a description or from images."""
 
 import dataclasses
 
@@ -54,21 +54,21 @@ def test_the_way_down_to_the_hole_is_proved_free_and_into_the_table_is_not(world
     assert world.certify(0, down).verdict == "collision"
 
 
-def test_a_pair_that_is_too_close_is_told_by_its_names(world):
+def test_a_pair_that_is_too_close_is_reported_by_its_names(world):
     q = world.demonstration.steps.joint_positions[0]
     apart = world.placed(0).nearest(q)
     assert world.too_close(0, q, apart.distance - 1e-5) is None
     assert world.too_close(0, q, apart.distance + 1e-5) == " / ".join(apart.pair)
 
 
-def test_only_what_is_known_to_move_is_told_to(picked, first_grasp, toolbox):
-    shown, robot = picked.demonstration, get_robot(toolbox.robot)
+def test_only_what_is_known_to_move_is_reported_to(picked, first_grasp, toolbox):
+    demo, robot = picked.demonstration, get_robot(toolbox.robot)
     assert picked.moving(0) is None and picked.moving(first_grasp + 5) is None
     # Carried away without being in the grasp, that is.
-    told = ExactWorld(dataclasses.replace(shown, touching=((),) * len(shown)), robot, toolbox.scene)
-    assert told.moving(first_grasp + 10) == "toolbox"
-    seen = CloudWorld(shown, robot, toolbox.scene)
-    assert all(seen.moving(t) is None for t in range(len(shown)))
+    blind = ExactWorld(dataclasses.replace(demo, touching=((),) * len(demo)), robot, toolbox.scene)
+    assert blind.moving(first_grasp + 10) == "toolbox"
+    seen = CloudWorld(demo, robot, toolbox.scene)
+    assert all(seen.moving(t) is None for t in range(len(demo)))
 
 
 def test_nothing_of_the_scene_but_what_was_seen_enters_a_cloud_s_certificate(

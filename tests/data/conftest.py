@@ -17,7 +17,7 @@ from sart_toolkit.data.records import (
 )
 from sart_toolkit.poses import pose
 
-Shown = tuple[Demonstration, Annotation]
+Source = tuple[Demonstration, Annotation]
 
 
 def _steps(n: int, rng: np.random.Generator) -> Steps:
@@ -27,10 +27,10 @@ def _steps(n: int, rng: np.random.Generator) -> Steps:
 
 
 @pytest.fixture(scope="session")
-def shown() -> Callable[[int], Shown]:
+def source_of() -> Callable[[int], Source]:
     """Makes the demonstration with a seed, and two spheres for it."""
 
-    def shown(seed: int) -> Shown:
+    def source_of(seed: int) -> Source:
         n, rng = 6, np.random.default_rng([9, seed])
         demonstration = Demonstration(
             task="nothing",
@@ -52,7 +52,7 @@ def shown() -> Callable[[int], Shown]:
         spheres = tuple(PrecisionSphere(t, Ts[t], 0.01 * (t + 1)) for t in (0, 2))
         return demonstration, Annotation(spheres, demonstration.content_hash())
 
-    return shown
+    return source_of
 
 
 @pytest.fixture(scope="session")

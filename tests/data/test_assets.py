@@ -23,7 +23,7 @@ def test_an_asset_is_found_beside_the_package_or_inside_it(
 
 
 @pytest.mark.parametrize("name", ["robots/none.urdf", "robots", "../pyproject.toml/x"])
-def test_a_missing_asset_is_told(name: str) -> None:
+def test_a_missing_asset_is_reported(name: str) -> None:
     with pytest.raises(MissingFile, match="no such asset of sart_toolkit"):
         sart.asset(name)
 

@@ -1,4 +1,4 @@
-"""A dataset directory: an index, and parts that are read when asked for and told when wrong."""
+"""A dataset directory: an index, and parts that are read when asked for and refused when wrong."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from sart_toolkit.errors import BrokenFile, Mismatch, MissingFile
 
 
 @pytest.fixture
-def made(shown, episode_of, tmp_path):
+def made(source_of, episode_of, tmp_path):
     """Two demonstrations, each with episodes from both of its spheres."""
-    sources = [shown(0), shown(1)]
+    sources = [source_of(0), source_of(1)]
     episodes = [
         episode_of(sources[source][0], sphere, k, source)
         for source in (0, 1)
@@ -81,20 +81,20 @@ def test_episodes_are_read_one_at_a_time_and_not_kept(made, monkeypatch):
     assert dataset.episode(0) is not dataset.episode(0)
 
 
-def test_a_missing_dataset_is_told(tmp_path):
+def test_a_missing_dataset_is_reported(tmp_path):
     with pytest.raises(MissingFile, match="no such dataset directory; make it with `sart augment`"):
         load_dataset(tmp_path / "nowhere")
     with pytest.raises(MissingFile, match="dataset.json: no such file"):
         load_dataset(tmp_path)
 
 
-def test_a_dataset_whose_generation_was_interrupted_is_told(made):
+def test_a_dataset_whose_generation_was_interrupted_is_reported(made):
     (made[0] / "dataset.json").unlink()
     with pytest.raises(BrokenFile, match="interrupted; run `sart augment` again to resume"):
         load_dataset(made[0])
 
 
-def test_a_dataset_without_its_manifest_is_told(made):
+def test_a_dataset_without_its_manifest_is_reported(made):
     (made[0] / "manifest.jsonl").unlink()
     with pytest.raises(MissingFile, match=r"manifest.jsonl: no such file; restore a copy"):
         load_dataset(made[0])
@@ -108,7 +108,7 @@ def test_a_dataset_without_its_manifest_is_told(made):
         lambda text: text.replace('"annotation": "', '"annotation": "0', 1),
     ],
 )
-def test_a_manifest_that_was_changed_is_told_by_the_hash(made, change):
+def test_a_manifest_that_was_changed_is_reported_by_the_hash(made, change):
     manifest = made[0] / "manifest.jsonl"
     manifest.write_text(change(manifest.read_text()))
     with pytest.raises(BrokenFile, match="content differs from its hash; generate it again"):
@@ -121,7 +121,7 @@ def test_a_dataset_s_hash_is_that_of_its_manifest(made):
         load_dataset(made[0])
 
 
-def test_a_missing_or_exchanged_episode_is_told_when_it_is_read(made, episode_of):
+def test_a_missing_or_exchanged_episode_is_reported_when_it_is_read(made, episode_of):
     path, sources, _ = made
     dataset = load_dataset(path)
     (path / dataset.index[2].name).unlink()
@@ -132,17 +132,17 @@ def test_a_missing_or_exchanged_episode_is_told_when_it_is_read(made, episode_of
         dataset.episode(3)
 
 
-def test_an_episode_of_another_demonstration_is_a_mismatch(shown, episode_of, tmp_path):
-    stranger = episode_of(shown(5)[0])
-    dataset = write_dataset(tmp_path / "d", [shown(0)], [stranger], {})
+def test_an_episode_of_another_demonstration_is_a_mismatch(source_of, episode_of, tmp_path):
+    stranger = episode_of(source_of(5)[0])
+    dataset = write_dataset(tmp_path / "d", [source_of(0)], [stranger], {})
     with pytest.raises(Mismatch, match="sphere00_k00000.h5 was generated from another demonst"):
         list(dataset)
 
 
-def test_another_demonstration_or_annotation_in_a_source_s_place_is_a_mismatch(made, shown):
+def test_another_demonstration_or_annotation_in_a_source_s_place_is_a_mismatch(made, source_of):
     path, *_ = made
     source = load_dataset(path).sources[0]
-    save_demonstration(source.path / "demo.h5", shown(1)[0])
+    save_demonstration(source.path / "demo.h5", source_of(1)[0])
     annotation = load_annotation(source.path / "annotation.json")
     wider = dataclasses.replace(annotation.spheres[0], radius=0.2)
     save_annotation(

@@ -318,7 +318,7 @@ def test_a_camera_record_that_does_not_fit_is_refused(change, message):
         ({"contact_force": np.zeros(3)}, r"contact_force: expected shape \(4,\), got \(3,\)"),
         (
             {"cameras": {"wrist": make_camera(3, np.random.default_rng(0))}},
-            "camera 'wrist': expected 4 pictures, got 3",
+            "camera 'wrist': expected 4 images, got 3",
         ),
     ],
 )
@@ -424,8 +424,8 @@ def test_a_digest_keeps_names_apart_from_values():
 def test_a_demonstrations_hash_follows_every_array_that_was_shown():
     demonstration = make_demonstration()
     hashes = {demonstration.content_hash()}
-    shown = [name for name in arrays_of(demonstration.steps) if "." not in name]
-    for name in shown:
+    names = [name for name in arrays_of(demonstration.steps) if "." not in name]
+    for name in names:
         changed = np.array(getattr(demonstration.steps, name))
         if changed.ndim == 3:
             changed[2] = changed[2] @ pose([0.01, 0, 0])
@@ -457,7 +457,7 @@ def test_a_demonstrations_hash_follows_every_array_that_was_shown():
         {"touching": (*demonstration.touching[:-1], (("a", "b"), ("c", "d"), ("e", "f")))},
     ):
         hashes.add(dataclasses.replace(demonstration, **change).content_hash())
-    assert len(hashes) == 1 + len(shown) + 4 + 8
+    assert len(hashes) == 1 + len(names) + 4 + 8
 
 
 def test_a_demonstrations_hash_leaves_out_clock_time_and_saved_states():
@@ -526,9 +526,9 @@ def test_rates_that_do_not_divide_are_refused(rates, message):
 
 
 def test_the_rates_are_part_of_what_was_shown():
-    shown = make_demonstration()
-    slow = dataclasses.replace(shown, rates=Rates(record_hz=5))
-    assert slow.content_hash() != shown.content_hash()
+    demo = make_demonstration()
+    slow = dataclasses.replace(demo, rates=Rates(record_hz=5))
+    assert slow.content_hash() != demo.content_hash()
 
 
 def test_a_camera_is_on_the_tool_or_in_the_world():

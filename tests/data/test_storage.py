@@ -1,4 +1,4 @@
-"""Files: what is written is read back, what is damaged is told, what was there survives."""
+"""Files: what is written is read back, what is damaged is reported, what was there survives."""
 
 import contextlib
 import dataclasses
@@ -254,13 +254,13 @@ LOADERS = [load_demonstration, load_episode, load_annotation, read_json]
 
 
 @pytest.mark.parametrize("load", LOADERS)
-def test_a_missing_file_is_told(load, tmp_path):
+def test_a_missing_file_is_reported(load, tmp_path):
     with pytest.raises(MissingFile, match="nowhere.h5: no such file; check the path"):
         load(tmp_path / "nowhere.h5")
 
 
 @pytest.mark.parametrize("load", LOADERS)
-def test_a_directory_in_place_of_a_file_is_told(load, tmp_path):
+def test_a_directory_in_place_of_a_file_is_reported(load, tmp_path):
     with pytest.raises(BrokenFile, match="is a directory; expected a file"):
         load(tmp_path)
 
@@ -300,7 +300,7 @@ def test_a_truncated_annotation_is_broken_wherever_it_was_cut(tmp_path):
             load_annotation(tmp_path / "cut.json")
 
 
-def test_a_file_of_another_kind_is_told_with_both_kinds(tmp_path):
+def test_a_file_of_another_kind_is_reported_with_both_kinds(tmp_path):
     demonstration = make_demonstration()
     save_demonstration(tmp_path / "demo.h5", demonstration)
     save_episode(tmp_path / "episode.h5", make_episode(demonstration))
@@ -315,7 +315,7 @@ def test_a_file_of_another_kind_is_told_with_both_kinds(tmp_path):
 
 
 @pytest.mark.parametrize("version", [0, SCHEMA_VERSION + 1, "new"])
-def test_a_schema_of_another_version_is_told(saved, version):
+def test_a_schema_of_another_version_is_reported(saved, version):
     _, load, _, path = saved
     if path.suffix == ".h5":
         with h5py.File(path, "r+") as file:
@@ -326,7 +326,7 @@ def test_a_schema_of_another_version_is_told(saved, version):
         load(path)
 
 
-def test_a_json_file_without_schema_is_told(tmp_path):
+def test_a_json_file_without_schema_is_reported(tmp_path):
     (tmp_path / "x.json").write_text("{}")
     with pytest.raises(BrokenFile, match="schema_version is None"):
         read_json(tmp_path / "x.json")
@@ -346,7 +346,7 @@ def test_json_that_is_no_object_is_broken(content, tmp_path):
         read_json(tmp_path / "x.json")
 
 
-def test_a_json_file_that_may_not_be_read_is_told(tmp_path, monkeypatch):
+def test_a_json_file_that_may_not_be_read_is_reported(tmp_path, monkeypatch):
     (tmp_path / "x.json").write_text("{}")
 
     def refused(*_, **__):
@@ -424,7 +424,7 @@ def test_a_demonstration_file_whose_content_is_wrong_is_broken(damage, tmp_path)
         load_demonstration(tmp_path / "demo.h5")
 
 
-def test_a_changed_demonstration_is_told_by_its_hash(tmp_path):
+def test_a_changed_demonstration_is_reported_by_its_hash(tmp_path):
     save_demonstration(tmp_path / "demo.h5", make_demonstration())
     with h5py.File(tmp_path / "demo.h5", "r+") as file:
         file["steps/cameras/wrist/rgb"][0, 0, 0, 0] ^= 1
@@ -461,29 +461,29 @@ def edited(tmp_path):
 
 
 @pytest.mark.parametrize("radius", [0, -0.02, float("nan"), float("inf")])
-def test_an_edited_radius_that_is_not_positive_is_told_with_file_and_waypoint(edited, radius):
+def test_an_edited_radius_that_is_not_positive_is_reported_with_file_and_waypoint(edited, radius):
     with pytest.raises(InvalidInput, match="annotation.json: radius of the sphere at waypoint 2"):
         edited(lambda value: value["spheres"][1].update(radius_m=radius))
 
 
-def test_an_unknown_sphere_field_is_told(edited):
+def test_an_unknown_sphere_field_is_reported(edited):
     with pytest.raises(BrokenFile, match="annotation.json: unknown sphere field 'radius'"):
         edited(lambda value: value["spheres"][0].update(radius=0.1))
 
 
-def test_an_unknown_annotation_field_is_told(edited):
+def test_an_unknown_annotation_field_is_reported(edited):
     with pytest.raises(BrokenFile, match="annotation.json: unknown .*'second_spent'"):
         edited(lambda value: value.update(second_spent=3))
 
 
 @pytest.mark.parametrize("field", ["waypoint", "radius_m", "T_world_key"])
-def test_a_missing_sphere_field_is_told(edited, field):
+def test_a_missing_sphere_field_is_reported(edited, field):
     with pytest.raises(BrokenFile, match=f"annotation.json: not an annotation, .*{field}"):
         edited(lambda value: value["spheres"][0].pop(field))
 
 
 @pytest.mark.parametrize("field", ["spheres", "demonstration_hash"])
-def test_a_missing_annotation_field_is_told(edited, field):
+def test_a_missing_annotation_field_is_reported(edited, field):
     with pytest.raises(BrokenFile, match=f"annotation.json: not an annotation, .*{field}"):
         edited(lambda value: value.pop(field))
 
@@ -621,16 +621,16 @@ def test_a_disk_that_fills_up_while_hdf5_writes_leaves_the_old_file_and_the_proc
     assert content_of(tmp_path) == before
 
 
-def test_a_folder_that_may_not_be_written_is_told(saved, tmp_path, monkeypatch):
+def test_a_folder_that_may_not_be_written_is_reported(saved, tmp_path, monkeypatch):
     save, _, record, path = saved
     before = content_of(tmp_path)
     refuse(monkeypatch, tempfile, "mkstemp", errno.EACCES)
-    with pytest.raises(CannotWrite, match="permission denied; choose another --out or mend"):
+    with pytest.raises(CannotWrite, match="permission denied; choose another --out or fix"):
         save(path, record)
     assert content_of(tmp_path) == before
 
 
-def test_a_path_below_a_file_is_told(saved, tmp_path):
+def test_a_path_below_a_file_is_reported(saved, tmp_path):
     save, _, record, path = saved
     before = content_of(tmp_path)
     with pytest.raises(CannotWrite, match=f"below{path.suffix}: "):
@@ -715,7 +715,7 @@ def test_remove_takes_a_link_and_leaves_what_it_points_to(tmp_path):
     assert content_of(tmp_path) == {str(tmp_path / "folder" / "x.txt"): b"kept"}
 
 
-def test_what_the_disk_does_not_let_go_is_told(tmp_path, monkeypatch):
+def test_what_the_disk_does_not_let_go_is_reported(tmp_path, monkeypatch):
     write_text(tmp_path / "x.txt", "")
     refuse(monkeypatch, os, "unlink", errno.EACCES)
     with pytest.raises(CannotWrite, match="x.txt: permission denied"):

@@ -22,11 +22,11 @@ N = 5
 
 
 @pytest.fixture
-def carry_out(shown, episode_of):
+def carry_out(source_of, episode_of):
     """Makes what is missing of `N` episodes from each of two spheres, every fourth rejected."""
 
     def carry_out(path, stop_after=None, **options):
-        sources = [shown(0)]
+        sources = [source_of(0)]
         with DatasetWriter(path, sources, {"n": N}, **options) as writer:
             done = 0
             for sphere in (0, 1):
@@ -54,8 +54,8 @@ def test_a_finished_dataset_says_how_its_attempts_ended(carry_out, tmp_path):
     assert info["least_clearance_m"] == 0.001 and info["task"] == "nothing"
 
 
-def test_what_is_missing_are_the_first_attempts_that_could_do(shown, episode_of, tmp_path):
-    demonstration, annotation = shown(0)
+def test_what_is_missing_are_the_first_attempts_that_could_do(source_of, episode_of, tmp_path):
+    demonstration, annotation = source_of(0)
     with DatasetWriter(tmp_path / "d", [(demonstration, annotation)], {}) as writer:
         writer.keep(writer.files.write(episode_of(demonstration, 1, 0)))
         writer.reject(AttemptKey(0, 1, 2), Rejection("joint jump", "detail"))
@@ -78,9 +78,9 @@ def test_resumed_after_any_attempt_it_becomes_the_same(carry_out, tmp_path, afte
     assert names[0] == names[1]
 
 
-def test_a_finished_dataset_is_there_at_once(carry_out, shown, tmp_path):
+def test_a_finished_dataset_is_there_at_once(carry_out, source_of, tmp_path):
     whole = carry_out(tmp_path / "d")
-    with DatasetWriter(tmp_path / "d", [shown(0)], {"n": N}) as writer:
+    with DatasetWriter(tmp_path / "d", [source_of(0)], {"n": N}) as writer:
         assert writer.finished is not None
         assert writer.finished.content_hash == whole.content_hash
 
@@ -169,9 +169,9 @@ def test_killed_at_any_moment_it_becomes_the_same(carry_out, tmp_path):
     assert [e.content_hash() for e in dataset] == [e.content_hash for e in whole.index]
 
 
-def test_a_second_process_is_refused_while_the_first_is_at_work(carry_out, shown, tmp_path):
+def test_a_second_process_is_refused_while_the_first_is_at_work(carry_out, source_of, tmp_path):
     path = tmp_path / "d"
-    with DatasetWriter(path, [shown(0)], {"n": N}):
+    with DatasetWriter(path, [source_of(0)], {"n": N}):
         manifest = str(path / "manifest.jsonl")
         found = subprocess.run(
             [sys.executable, "-c", _OTHER, manifest], capture_output=True, text=True
@@ -183,28 +183,28 @@ def test_a_second_process_is_refused_while_the_first_is_at_work(carry_out, shown
     assert carry_out(path) is not None
 
 
-def test_other_settings_are_refused_and_named(carry_out, shown, tmp_path):
+def test_other_settings_are_refused_and_named(carry_out, source_of, tmp_path):
     path = tmp_path / "d"
     carry_out(path, 3)
-    demonstration, annotation = shown(0)
+    demonstration, annotation = source_of(0)
     wider = (dataclasses.replace(annotation.spheres[0], radius=0.2), *annotation.spheres[1:])
     other = dataclasses.replace(annotation, spheres=wider)
     before = {p: p.stat().st_mtime_ns for p in (path, *path.rglob("*"))}
     for sources, request, named in (
-        ([shown(0)], {"n": 4}, rf"\(request.n {N}, now 4\)"),
-        ([shown(0)], {"n": N, "camera": "wrist"}, r'\(request.camera null, now "wrist"\)'),
+        ([source_of(0)], {"n": 4}, rf"\(request.n {N}, now 4\)"),
+        ([source_of(0)], {"n": N, "camera": "wrist"}, r'\(request.camera null, now "wrist"\)'),
         ([(demonstration, other)], {"n": N}, r'\(sources.0.annotation "\w+..., now "\w+...\)'),
-        ([shown(0), shown(1)], {"n": N}, r"\(1 sources, now 2\)"),
+        ([source_of(0), source_of(1)], {"n": N}, r"\(1 sources, now 2\)"),
     ):
         with pytest.raises(OutputExists, match=f"made with other settings {named}; add --overw"):
             DatasetWriter(path, sources, request)
     assert {p: p.stat().st_mtime_ns for p in (path, *path.rglob("*"))} == before
 
 
-def test_overwriting_begins_again_and_leaves_nothing_of_the_old(carry_out, shown, tmp_path):
+def test_overwriting_begins_again_and_leaves_nothing_of_the_old(carry_out, source_of, tmp_path):
     path = tmp_path / "d"
     carry_out(path)
-    with DatasetWriter(path, [shown(3)], {"n": 2}, overwrite=True) as writer:
+    with DatasetWriter(path, [source_of(3)], {"n": 2}, overwrite=True) as writer:
         assert writer.finished is None and writer.n_kept == writer.n_rejected == 0
         inside = sorted(str(p.relative_to(path)) for p in path.rglob("*.*"))
     assert inside == [
@@ -225,7 +225,7 @@ def test_a_directory_or_file_of_someone_else_is_left_alone(carry_out, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_manifest_that_can_not_be_read_is_told_and_may_be_overwritten(carry_out, tmp_path):
+def test_a_manifest_that_can_not_be_read_is_reported_and_may_be_overwritten(carry_out, tmp_path):
     (tmp_path / "manifest.jsonl").write_text('{"schema_version": 1}\n')
     with pytest.raises(BrokenFile, match="schema_version is 1"):
         carry_out(tmp_path)
@@ -237,12 +237,12 @@ def test_an_interruption_before_the_first_row_can_be_resumed(carry_out, tmp_path
     assert len(carry_out(tmp_path)) == 2 * N
 
 
-def test_sources_are_checked(shown, tmp_path):
+def test_sources_are_checked(source_of, tmp_path):
     with pytest.raises(InvalidInput, match="sources: expected at least one demonstration"):
         DatasetWriter(tmp_path / "d", [], {})
     with pytest.raises(Mismatch, match="annotation was made for another demonstration"):
-        DatasetWriter(tmp_path / "d", [(shown(0)[0], shown(1)[1])], {})
-    demonstration, annotation = shown(0)
+        DatasetWriter(tmp_path / "d", [(source_of(0)[0], source_of(1)[1])], {})
+    demonstration, annotation = source_of(0)
     for what in ("task", "robot"):
         other = dataclasses.replace(demonstration, **{what: "another"})
         spheres = dataclasses.replace(annotation, demonstration_hash=other.content_hash())
@@ -251,8 +251,8 @@ def test_sources_are_checked(shown, tmp_path):
     assert not (tmp_path / "d").exists()
 
 
-def test_what_writes_episodes_goes_to_other_processes(shown, episode_of, tmp_path):
-    demonstration, annotation = shown(0)
+def test_what_writes_episodes_goes_to_other_processes(source_of, episode_of, tmp_path):
+    demonstration, annotation = source_of(0)
     with DatasetWriter(tmp_path / "d", [(demonstration, annotation)], {}) as writer:
         files = pickle.loads(pickle.dumps(writer.files))  # noqa: S301 - written here
         entry = files.write(episode_of(demonstration))
@@ -262,7 +262,7 @@ def test_what_writes_episodes_goes_to_other_processes(shown, episode_of, tmp_pat
         assert len(writer.finish({})) == 1
 
 
-def test_a_full_disk_is_told_and_resumed_from(carry_out, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_resumed_from(carry_out, tmp_path, monkeypatch):
     whole = carry_out(tmp_path / "whole")
     save, left = writer_module.save_episode, [5]
 

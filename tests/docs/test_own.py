@@ -18,7 +18,7 @@ from sart_toolkit.data.dataset import MANIFEST, load_dataset
 from sart_toolkit.data.storage import load_demonstration, read_json
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
-# The file, the task, and what `record` and `augment` are told.
+# The file, the task, and the options of `record` and `augment`.
 OWN = {
     "robot": ("04_own_robot.py", "peg_in_hole", ["--robot", "04_own_robot.py:IIWA"], []),
     "task": ("05_own_task.py", "05_own_task.py:Drawer", [], []),
@@ -51,8 +51,8 @@ def interrupted(argv: list[str], manifest: Path, wait_until: Callable[..., None]
             120.0,
         )
         os.killpg(process.pid, signal.SIGINT)
-        told = process.communicate(timeout=60)[1].decode()
-    assert process.returncode == 130 and "type the same command again" in told, told
+        stderr = process.communicate(timeout=60)[1].decode()
+    assert process.returncode == 130 and "type the same command again" in stderr, stderr
 
 
 @pytest.mark.parametrize("kind", OWN)

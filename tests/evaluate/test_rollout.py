@@ -125,7 +125,7 @@ def test_steering_out_of_reach_ends_the_rollout_with_that_reason(roll_out, peg_m
     assert result.reason.startswith("steered out of reach: tool pose at (")
 
 
-def test_a_skill_sees_the_wrist_picture_and_the_gripper_at_every_step(
+def test_a_skill_sees_the_wrist_image_and_the_gripper_at_every_step(
     roll_out, replay, peg_demonstration
 ):
     result = roll_out(replay)
@@ -139,17 +139,17 @@ def test_a_skill_sees_the_wrist_picture_and_the_gripper_at_every_step(
 def test_the_same_rollout_twice_is_the_same(roll_out, replay):
     task = get_task("peg_in_hole")
     task.horizon = 3.0
-    pictures = []
+    images = []
     for _ in range(2):
-        pictures.append([])
+        images.append([])
         roll_out(
             replay,
             Placement(0.01, 0.02),
             task,
-            watch=lambda seen, *_: pictures[-1].append(seen.cameras["wrist"].rgb),
+            watch=lambda seen, *_: images[-1].append(seen.cameras["wrist"].rgb),
         )
-    np.testing.assert_array_equal(*pictures)
-    assert len(pictures[0]) >= 30
+    np.testing.assert_array_equal(*images)
+    assert len(images[0]) >= 30
 
 
 # --- many rollouts ------------------------------------------------------------------------------
@@ -180,7 +180,7 @@ def test_placements_follow_from_the_evaluation_seed_and_the_episode_alone(peg_ta
     assert drawn != [episode_placement(peg_task, 8, i) for i in range(50)]
 
 
-def test_objects_are_turned_and_looks_vary_where_asked_for(evaluate, short_task):
+def test_objects_are_turned_and_the_appearance_varies_where_asked_for(evaluate, short_task):
     class Watching(Player):
         def reset(self):
             super().reset()
@@ -190,18 +190,18 @@ def test_objects_are_turned_and_looks_vary_where_asked_for(evaluate, short_task)
     for name, options in (
         ("plain", {}),
         ("turned", {"yaw_deg": 15.0}),
-        ("looks", {"vary_looks": True}),
+        ("appearance", {"vary_appearance": True}),
     ):
         player = Watching()
         player.rollouts = []
         rows = evaluate(player, short_task, EvaluateConfig(3, 0, **options))["episodes"]
         placements[name] = [row["placement"]["block"] for row in rows]
-        # The table's colour in the corner of each rollout's first picture.
+        # The table's colour in the corner of each rollout's first image.
         tables[name] = {tuple(seen[0][0][-1, 0]) for seen in player.rollouts}
-    assert placements["plain"] == placements["looks"]
+    assert placements["plain"] == placements["appearance"]
     assert {p["yaw_deg"] for p in placements["plain"]} == {0.0}
     assert len({p["yaw_deg"] for p in placements["turned"]}) == 3
-    assert len(tables["plain"]) == 1 and len(tables["looks"]) == 3
+    assert len(tables["plain"]) == 1 and len(tables["appearance"]) == 3
 
 
 def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
@@ -221,7 +221,7 @@ def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
     assert result["ci95"] == result["ci95_any"] == list(wilson_interval(0, 3))
     assert result["seeds"] == {"eval_seed": 11, "episodes": [[11, 0], [11, 1], [11, 2]]}
     assert result["seconds"] > 0 and result["videos"] == [] and "python" in result["versions"]
-    asked = {"episodes": 3, "eval_seed": 11, "videos": 0, "yaw_deg": 0.0, "vary_looks": False}
+    asked = {"episodes": 3, "eval_seed": 11, "videos": 0, "yaw_deg": 0.0, "vary_appearance": False}
     assert result["config"] == asked
     for i, row in enumerate(result["episodes"]):
         assert row["episode"] == i and row["seed"] == [11, i] and row["steps"] == 6

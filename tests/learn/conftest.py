@@ -1,4 +1,4 @@
-"""Small synthetic datasets: a bright blob whose place in the picture decides the action."""
+"""Small synthetic datasets: a bright blob whose place in the image decides the action."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from sart_toolkit.poses import pose
 GAIN = 0.01
 
 
-def blob_picture(u: float, v: float, rng: np.random.Generator, size: int) -> np.ndarray:
+def blob_image(u: float, v: float, rng: np.random.Generator, size: int) -> np.ndarray:
     at = np.linspace(-1, 1, size)
     blob = np.exp(-((at[None, :] - u) ** 2 + (at[:, None] - v) ** 2) / 0.08)
-    picture = 60 + 150 * blob[..., None] * [1.0, 0.6, 0.3] + rng.normal(0, 3, (size, size, 3))
-    return np.clip(picture, 0, 255).astype(np.uint8)
+    image = 60 + 150 * blob[..., None] * [1.0, 0.6, 0.3] + rng.normal(0, 3, (size, size, 3))
+    return np.clip(image, 0, 255).astype(np.uint8)
 
 
 def make_steps(
     n: int, rng: np.random.Generator, T_world_next: np.ndarray | None = None, size: int = 32
 ) -> Steps:
-    """Steps whose action t is GAIN * (u, v) of picture t, the last leading to `T_world_next`."""
+    """Steps whose action t is GAIN * (u, v) of image t, the last leading to `T_world_next`."""
     places = rng.uniform(-0.8, 0.8, (n, 2))
     commanded = np.tile(pose((0.4, 0.0, 0.3)), (n + 1, 1, 1))
     commanded[1:, :2, 3] += GAIN * np.cumsum(places, 0)
@@ -59,7 +59,7 @@ def make_steps(
         contact_force=np.zeros(n),
         cameras={
             "wrist": CameraRecord(
-                rgb=np.stack([blob_picture(u, v, rng, size) for u, v in places]),
+                rgb=np.stack([blob_image(u, v, rng, size) for u, v in places]),
                 depth=np.zeros((n, size, size), np.float32),
                 intrinsics=np.diag([size, size, 1.0]),
                 frame="tool",
@@ -159,7 +159,7 @@ def _with_steps(
 
 @pytest.fixture(name="open_windows")
 def _open_windows(tmp_path: Path) -> Callable[..., Windows]:
-    """`open_windows` in an empty directory each time, of the wrist camera unless told."""
+    """`open_windows` in an empty directory each time, of the wrist camera unless specified."""
 
     def opened(dataset: Dataset, image_size: int = 16, history: int = 2, **options: Any) -> Windows:
         config = WindowConfig(options.pop("cameras", ("wrist",)), image_size, history, **options)

@@ -51,7 +51,7 @@ def test_windows_are_exactly_the_steps_of_all_trajectories(
     assert len(found) == len(windows.history)
 
 
-def test_each_picture_is_stored_once(make_dataset, open_windows):
+def test_each_image_is_stored_once(make_dataset, open_windows):
     dataset = make_dataset((2,) * 20)
     windows = open_windows(dataset)
     assert len(windows.frames.images["wrist"]) == len(dataset.sources[0].demonstration) + 20 * 4
@@ -237,7 +237,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_read(dataset, tmp_pat
     assert not read
 
 
-def test_a_disk_that_fills_up_is_told_and_leaves_nothing(dataset, tmp_path):
+def test_a_disk_that_fills_up_is_reported_and_leaves_nothing(dataset, tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
     try:

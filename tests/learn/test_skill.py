@@ -76,8 +76,8 @@ def test_a_skill_acts_as_the_policy_did_in_training(
 @pytest.mark.parametrize("few", [True, False])
 def test_the_gripper_is_commanded_as_was_shown_unless_that_was_much(trained, dataset, few):
     demonstration = dataset.sources[0].demonstration
-    shown = np.linspace(0, 0.8, 3 if few else len(demonstration.steps))
-    commands = np.resize(shown, len(demonstration.steps))
+    demo = np.linspace(0, 0.8, 3 if few else len(demonstration.steps))
+    commands = np.resize(demo, len(demonstration.steps))
     steps = dataclasses.replace(demonstration.steps, commanded_gripper=commands)
     skill = load_skill(trained[0])
     other = dataclasses.replace(demonstration, steps=steps)
@@ -88,7 +88,7 @@ def test_the_gripper_is_commanded_as_was_shown_unless_that_was_much(trained, dat
             demonstration.steps.cameras["wrist"].rgb, np.linspace(0, 1, len(steps)), strict=True
         )
     }
-    assert (commanded <= set(shown)) == few
+    assert (commanded <= set(demo)) == few
 
 
 class _Spy(Policy):

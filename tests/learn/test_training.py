@@ -57,7 +57,7 @@ def test_it_learns_where_the_blob_is_and_transfers_to_images_never_seen(
     with torch.inference_mode():
         predicted = result.policy.predict(batch)
     actions = batch["action"]
-    # The last action of a trajectory holds still whatever the picture shows.
+    # The last action of a trajectory holds still whatever the image shows.
     moving = actions[:, :2].abs().sum(1) > 0
     error = (predicted - actions)[moving, :2].square().mean()
     assert error < 0.05 * actions[moving, :2].var(0).mean()
@@ -96,7 +96,7 @@ def test_what_only_the_second_camera_shows_is_learned(make_dataset, with_steps, 
     assert final[2] < 0.7 * final[1]
 
 
-def test_every_trajectory_is_read_once_and_told(dataset, small_config, tmp_path):
+def test_every_trajectory_is_read_once_and_reported(dataset, small_config, tmp_path):
     read = []
     train(dataset, small_config, tmp_path, reading=lambda *n: read.append(n))
     assert read == [(1, 4), (2, 4), (3, 4), (4, 4)]

@@ -1,4 +1,4 @@
-"""The UR5e with its gripper, and a way to try it with other joint limits."""
+"""The UR5e with its gripper, and a way to test it with other joint limits."""
 
 from __future__ import annotations
 

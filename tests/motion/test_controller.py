@@ -93,7 +93,7 @@ def test_pressing_on_against_a_wall_holds_the_command_at_the_lead(controller):
     np.testing.assert_allclose(controller.commanded_T_world_tool, expected, atol=1e-9)
 
 
-def test_the_command_is_never_anchored_anew_to_the_measured_pose(controller):
+def test_the_command_is_never_anchored_again_to_the_measured_pose(controller):
     commanded = controller.commanded_T_world_tool
     sagging = commanded @ pose([0, 0, 0.008], [0.03, 0, 0])
     for _ in range(10):
@@ -121,7 +121,7 @@ def test_the_desired_pose_is_approached_in_a_straight_line_of_even_steps(model, 
 
 @PROPERTY
 @given(steps=st.lists(offsets(0.01, 0.04), min_size=2, max_size=6))
-def test_each_move_goes_on_from_the_last_command(model, steps):
+def test_each_move_continues_from_the_last_command(model, steps):
     controller = make_controller(model)
     for away in steps:
         start = controller.commanded_T_world_tool
@@ -373,12 +373,12 @@ def test_a_bound_that_is_not_positive_is_refused(name, unit, bad):
         ControllerConfig(**{name: bad})
 
 
-def test_the_lead_is_20_mm_and_5_degrees_unless_told_otherwise():
+def test_the_lead_is_20_mm_and_5_degrees_unless_specified_otherwise():
     config = ControllerConfig()
     assert (config.max_lead, config.max_lead_deg) == (0.020, 5.0)
 
 
-def test_the_command_goes_on_from_what_was_really_sent(controller, model):
+def test_the_command_continues_from_what_was_really_sent(controller, model):
     T = controller.commanded_T_world_tool
     targets = controller.move(T @ pose([0.01, 0, 0]), T, 1)
     controller.acknowledge(targets[0])

@@ -76,11 +76,11 @@ def test_every_pose_is_on_the_line(model, motion, duration):
 @given(motion=motions(), deviation=st.sampled_from([1e-5, 2e-5, 1e-4, 1e-3]))
 def test_the_joints_keep_the_tool_on_the_line_as_nearly_as_is_said(model, motion, deviation):
     line = from_home(model, motion, 2.0, deviation=deviation)
-    # It is looked at half way between knots; at the path's ends it may be a little more elsewhere.
+    # It is sampled half way between knots; at the path's ends it may be a little more elsewhere.
     assert farthest_off(model, line) <= 1.3 * deviation + IK_ACCURACY
 
 
-def test_unless_told_otherwise_the_tool_is_within_0_02_mm_of_the_line(model):
+def test_unless_specified_otherwise_the_tool_is_within_0_02_mm_of_the_line(model):
     line = from_home(model, pose([0.1, 0.05, -0.05], [0.1, 0.3, -0.2]), 2.0)
     assert farthest_off(model, line) <= 2e-5
 

@@ -151,7 +151,7 @@ def test_a_polyline_keeps_its_configurations():
 
 @PROPERTY
 @given(seed=seeds, i=st.integers(0, 8), a=st.floats(0, 1), b=st.floats(0, 1))
-def test_a_polyline_has_no_bulge_between_neighbours(seed, i, a, b):
+def test_a_polyline_has_no_deviation_between_neighbours(seed, i, a, b):
     path = polyline(seed, 10)
     start, end = sorted([(i + a) / 9, (i + b) / 9])
     assert path.chord_deviation(np.array([start]), np.array([end])).max() < 1e-9
@@ -187,7 +187,7 @@ def off_the_chord(path, start, end, allowed, n=200):
 
 @settings(PROPERTY, max_examples=300)
 @given(path=paths, ends=st.tuples(st.floats(0, 1), st.floats(0, 1)), zoom=st.floats(0, 1))
-def test_the_path_is_never_farther_from_a_chord_than_the_bulge(path, ends, zoom):
+def test_the_path_is_never_farther_from_a_chord_than_the_bound(path, ends, zoom):
     start, end = sorted(ends)
     end = start + zoom * (end - start)
     (allowed,) = path.chord_deviation(np.array([start]), np.array([end]))
@@ -197,7 +197,7 @@ def test_the_path_is_never_farther_from_a_chord_than_the_bulge(path, ends, zoom)
 
 @PROPERTY
 @given(seed=seeds, count=counts, k=st.integers(2, 5))
-def test_the_path_is_never_farther_from_chords_between_its_own_points_than_the_bulge(
+def test_the_path_is_never_farther_from_chords_between_its_own_points_than_the_bound(
     seed, count, k
 ):
     # Where a polyline's corners are exactly on the intervals' ends.
@@ -209,7 +209,7 @@ def test_the_path_is_never_farther_from_chords_between_its_own_points_than_the_b
 
 @PROPERTY
 @given(path=paths, parts=st.integers(1, 12))
-def test_bulges_of_many_intervals_are_those_of_each(path, parts):
+def test_deviations_of_many_intervals_are_those_of_each(path, parts):
     s = np.linspace(0, 1, parts + 1)
     together = path.chord_deviation(s[:-1], s[1:])
     for row, start, end in zip(together, s[:-1], s[1:], strict=True):
@@ -220,7 +220,7 @@ def test_bulges_of_many_intervals_are_those_of_each(path, parts):
 
 @PROPERTY
 @given(path=paths)
-def test_finer_intervals_bulge_less(path):
+def test_finer_intervals_deviate_less(path):
     greatest = []
     for parts in (1, 8, 64, 4096):
         s = np.linspace(0, 1, parts + 1)
@@ -230,7 +230,7 @@ def test_finer_intervals_bulge_less(path):
     assert greatest[-1] <= 0.5 * greatest[0] + 1e-12
 
 
-def test_a_way_there_and_back_bulges_by_all_of_it():
+def test_a_way_there_and_back_deviates_by_all_of_it():
     path = PolylinePath([np.zeros(3), [1.0, 0.5, 0.0], np.zeros(3)])
     np.testing.assert_allclose(path.chord_deviation(np.zeros(1), np.ones(1)), [[1.0, 0.5, 0.0]])
     # From a third there and a third back: two thirds of the way on.

@@ -403,14 +403,14 @@ def test_a_configuration_outside_the_limits_is_refused(start, plan):
         plan(start[:5])
 
 
-@pytest.mark.parametrize("name", ["window", "edge", "spare", "tries", "shortcuts", "max_edges"])
+@pytest.mark.parametrize("name", ["window", "edge", "spare", "attempts", "shortcuts", "max_edges"])
 @pytest.mark.parametrize("bad", [0, -1, np.nan])
 def test_a_setting_that_is_not_positive_is_refused(name, bad):
     with pytest.raises(InvalidInput, match=f"{name}: expected a finite number > 0"):
         PlanConfig(**{name: bad})
 
 
-@pytest.mark.parametrize("name", ["tries", "shortcuts", "max_edges"])
+@pytest.mark.parametrize("name", ["attempts", "shortcuts", "max_edges"])
 def test_a_count_that_is_no_whole_number_is_refused(name):
     with pytest.raises(InvalidInput, match=f"{name}: expected a whole number, got 2.5"):
         PlanConfig(**{name: 2.5})

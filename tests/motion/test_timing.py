@@ -74,7 +74,7 @@ def test_a_tighter_limit_holds_too_and_takes_longer(model, with_limits, seed, na
     try:
         motion = moved(slower, seed, 1.0)
     except MotionRejected as error:
-        # Bounds are of the whole path: a joint that is fast where the law is slow meets a limit
+        # Bounds are of the whole path: a joint that is fast where the timing is slow meets a limit
         # drawn from its true accelerations only in ages.
         assert "more than 600 s" in str(error)
         reject()
@@ -175,7 +175,7 @@ def test_derivatives_are_those_of_the_joints_in_time(model, seed, duration):
     q = motion.joints(times)
     velocity, acceleration, jerk = motion.derivatives(times)
     spread = np.ptp(q, axis=0).max()
-    # Differences are of second order in h; the law's jerk jumps a few times.
+    # Differences are of second order in h; the timing's jerk jumps a few times.
     for exact, rough, order in (
         (velocity[1:-1], (q[2:] - q[:-2]) / (2 * h), 1),
         (acceleration[1:-1], (velocity[2:] - velocity[:-2]) / (2 * h), 2),

@@ -55,28 +55,30 @@ def core(make_peg_backend, peg_task, peg_model, limited):
 def test_a_robot_that_can_do_nothing_but_move_is_recorded_from_where_it_is(
     core, peg_task, peg_model, peg_demonstration
 ):
-    shown = record_demonstration(core, peg_task, peg_model, operator(peg_task, peg_model))
+    demo = record_demonstration(core, peg_task, peg_model, operator(peg_task, peg_model))
     steps = peg_demonstration.steps
     np.testing.assert_allclose(
-        shown.steps.measured_Ts_world_tool[0], steps.measured_Ts_world_tool[0], atol=1e-4
+        demo.steps.measured_Ts_world_tool[0], steps.measured_Ts_world_tool[0], atol=1e-4
     )
     np.testing.assert_allclose(
-        shown.steps.commanded_Ts_world_tool[-1], steps.commanded_Ts_world_tool[-1], atol=5e-3
+        demo.steps.commanded_Ts_world_tool[-1], steps.commanded_Ts_world_tool[-1], atol=5e-3
     )
-    assert shown.body_Ts_world == {} and shown.states == ()
-    assert np.isnan(shown.steps.contact_force).all()
-    assert shown.judged_by == "nobody" and not shown.success.any()
-    assert shown.steps.cameras["wrist"].rgb.any()
+    assert demo.body_Ts_world == {} and demo.states == ()
+    assert np.isnan(demo.steps.contact_force).all()
+    assert demo.judged_by == "nobody" and not demo.success.any()
+    assert demo.steps.cameras["wrist"].rgb.any()
 
 
 def test_a_force_is_recorded_where_only_a_force_is_felt(core, peg_task, peg_model, limited):
     arm = limited(core.inner, SensesForce)
-    shown = record_demonstration(arm, peg_task, peg_model, operator(peg_task, peg_model), None, 0)
-    assert (shown.steps.contact_force >= 0).all() and not any(shown.touching)
+    demo = record_demonstration(arm, peg_task, peg_model, operator(peg_task, peg_model), None, 0)
+    assert (demo.steps.contact_force >= 0).all() and not any(demo.touching)
 
 
 def test_a_recording_that_does_not_end_says_why_its_success_is_unknown(core, peg_task, peg_model):
-    with pytest.raises(InvalidInput, match="'limited' can't tell, for want of KnowsBodies; steer"):
+    with pytest.raises(
+        InvalidInput, match="'limited' can't tell, since it lacks KnowsBodies; steer"
+    ):
         record_demonstration(
             core, peg_task, peg_model, operator(peg_task, peg_model),
             config=dataclasses.replace(BLIND, max_seconds=0.5),
@@ -96,16 +98,16 @@ def test_a_person_says_whether_the_goal_was_reached_where_the_backend_can_t(
     desk.press(Control.NEXT)
     assert "Was the goal reached? → saves it as reached" in desk.notice.text
     desk.press(Control.NEXT)
-    (shown,) = saved
-    assert shown.judged_by == "person" and peg_task.achieved(shown.success)
-    assert not shown.success[: -round(peg_task.hold * 10)].any()
+    (demo,) = saved
+    assert demo.judged_by == "person" and peg_task.achieved(demo.success)
+    assert not demo.success[: -round(peg_task.hold * 10)].any()
 
 
 def test_a_person_s_word_is_not_asked_where_the_backend_tells(peg_backend, peg_task, peg_model):
     session = TeleopSession(peg_backend, peg_task, peg_model, config=BLIND)
     session.start()
     session.stop()
-    with pytest.raises(InvalidInput, match="say_reached: this backend tells by itself"):
+    with pytest.raises(InvalidInput, match="say_reached: this backend itself decides"):
         session.say_reached()
 
 
@@ -128,7 +130,7 @@ def test_what_needs_an_ability_names_it_and_says_what_for(
 def test_what_a_robot_was_really_sent_is_what_is_recorded(
     peg_backend, peg_task, peg_model, limited, monkeypatch
 ):
-    """And the next command goes on from there."""
+    """And the next command continues from there."""
     arm, sent = limited(peg_backend, Resets, KnowsBodies), []
 
     def half_as_far(q, gripper):
@@ -137,13 +139,13 @@ def test_what_a_robot_was_really_sent_is_what_is_recorded(
         return peg_backend.command(sent[-1].q, sent[-1].gripper) and sent[-1]
 
     monkeypatch.setattr(arm, "command", half_as_far)
-    shown = record_demonstration(
+    demo = record_demonstration(
         arm, peg_task, peg_model, operator(peg_task, peg_model), config=BLIND
     )
     every_third = np.array([command.q for command in sent[2::3]])
-    np.testing.assert_array_equal(shown.steps.commanded_joint_positions[1:], every_third)
-    assert (shown.steps.commanded_gripper[1:] <= 0.6).all()
-    for q, T in zip(every_third, shown.steps.commanded_Ts_world_tool[1:], strict=True):
+    np.testing.assert_array_equal(demo.steps.commanded_joint_positions[1:], every_third)
+    assert (demo.steps.commanded_gripper[1:] <= 0.6).all()
+    for q, T in zip(every_third, demo.steps.commanded_Ts_world_tool[1:], strict=True):
         np.testing.assert_allclose(peg_model.fk(q), T, atol=1e-5)
 
 
@@ -152,22 +154,22 @@ def test_what_a_robot_was_really_sent_is_what_is_recorded(
 
 @pytest.fixture(scope="module")
 def seen_twice(peg_task, peg_model, tmp_path_factory):
-    """A demonstration with rectangular pictures of wrist and overview, read from its file."""
+    """A demonstration with rectangular images of wrist and overview, read from its file."""
     robot = get_robot(peg_task.robot)
     backend = make_backend("pybullet", robot, peg_task.scene, "64x48")
     config = SessionConfig(("wrist", "overview"))
     device = operator(peg_task, peg_model)
-    shown = record_demonstration(backend, peg_task, peg_model, device, config=config)
+    demo = record_demonstration(backend, peg_task, peg_model, device, config=config)
     views = [row.T_world_camera for row in backend.observe(("wrist", "overview")).cameras.values()]
     backend.close()
     path = tmp_path_factory.mktemp("seen") / "demo.h5"
-    save_demonstration(path, shown)
+    save_demonstration(path, demo)
     return load_demonstration(path), views
 
 
 def test_cameras_are_recorded_with_the_frame_that_they_are_mounted_on(seen_twice, peg_task):
-    shown, (wrist_at_end, overview_at_end) = seen_twice
-    cameras, Ts = shown.steps.cameras, shown.steps.measured_Ts_world_tool
+    demo, (wrist_at_end, overview_at_end) = seen_twice
+    cameras, Ts = demo.steps.cameras, demo.steps.measured_Ts_world_tool
     assert {name: camera.frame for name, camera in cameras.items()} == {
         "wrist": "tool", "overview": "world",
     }  # fmt: skip
@@ -179,25 +181,25 @@ def test_cameras_are_recorded_with_the_frame_that_they_are_mounted_on(seen_twice
     np.testing.assert_allclose(cameras["wrist"].Ts_world_camera(Ts)[-1], wrist_at_end, atol=1e-5)
 
 
-def test_rectangular_pictures_are_recorded_with_their_intrinsics(seen_twice, peg_task):
-    shown, _ = seen_twice
+def test_rectangular_images_are_recorded_with_their_intrinsics(seen_twice, peg_task):
+    demo, _ = seen_twice
     for spec in (get_robot(peg_task.robot).cameras[0], peg_task.scene.cameras[0]):
-        camera = shown.steps.cameras[spec.name]
+        camera = demo.steps.cameras[spec.name]
         assert camera.rgb.shape[1:] == (48, 64, 3)
         np.testing.assert_array_equal(camera.intrinsics, spec.intrinsics(64, 48))
 
 
 @pytest.mark.parametrize("cameras", [("wrist",), ("overview",), ("wrist", "overview")])
 def test_the_block_is_where_it_is_in_a_cloud_of_any_cameras(seen_twice, peg_task, cameras):
-    shown, _ = seen_twice
-    kept = {name: shown.steps.cameras[name] for name in cameras}
-    steps = dataclasses.replace(shown.steps, cameras=kept)
+    demo, _ = seen_twice
+    kept = {name: demo.steps.cameras[name] for name in cameras}
+    steps = dataclasses.replace(demo.steps, cameras=kept)
     config = CloudConfig(unknown="free", far=2.0)
     cloud = fuse_cloud(
-        dataclasses.replace(shown, steps=steps), get_robot(peg_task.robot), peg_task.scene.held,
+        dataclasses.replace(demo, steps=steps), get_robot(peg_task.robot), peg_task.scene.held,
         config=config,
     )  # fmt: skip
-    T = shown.body_Ts_world["block"][0]
+    T = demo.body_Ts_world["block"][0]
     p = (cloud.points - T[:3, 3]) @ T[:3, :3]
     wood = (np.abs(p[:, :2]) < 0.08).all(1) & (np.abs(p[:, 2]) < 0.06) & (p[:, 2] > 0.015)
     assert wood.sum() > 50
@@ -208,16 +210,16 @@ def test_the_block_is_where_it_is_in_a_cloud_of_any_cameras(seen_twice, peg_task
 
 
 def test_segments_are_seen_by_the_demonstration_s_cameras(seen_twice, peg_task, tmp_path):
-    shown, _ = seen_twice
+    demo, _ = seen_twice
     robot = get_robot(peg_task.robot)
-    annotation = suggest_annotation(shown, ExactWorld(shown, robot, peg_task.scene), [4])
+    annotation = suggest_annotation(demo, ExactWorld(demo, robot, peg_task.scene), [4])
 
     def make():
         return make_backend("pybullet", robot, peg_task.scene, (64, 48))
 
-    made = augment_demonstration(shown, annotation, make, tmp_path / "d", AugmentConfig(n=2))
+    made = augment_demonstration(demo, annotation, make, tmp_path / "d", AugmentConfig(n=2))
     for name, camera in made.episode(0).steps.cameras.items():
-        reference = shown.steps.cameras[name]
+        reference = demo.steps.cameras[name]
         assert camera.rgb.shape[1:] == reference.rgb.shape[1:] and camera.frame == reference.frame
         np.testing.assert_allclose(camera.T_frame_camera, reference.T_frame_camera, atol=1e-5)
 
@@ -233,8 +235,8 @@ def test_a_camera_on_the_arm_before_the_tool_is_refused(peg_task, peg_model):
     session = TeleopSession(backend, peg_task, peg_model, config=SessionConfig(("base",)))
     session.start()
     session.stop()
-    shown = session.demonstration("test", "none", 0.0)
-    assert shown.steps.cameras["base"].frame == "world"
+    demo = session.demonstration("test", "none", 0.0)
+    assert demo.steps.cameras["base"].frame == "world"
     backend.close()
 
 
@@ -251,22 +253,22 @@ def test_a_demonstration_and_its_segments_at_other_rates(peg_task, peg_model, na
 
     backend = make()
     device = operator(peg_task, peg_model, rates.control_hz)
-    shown = record_demonstration(backend, peg_task, peg_model, device, config=BLIND)
-    assert shown.rates == rates and peg_task.achieved(shown.success, rates.record_hz)
-    assert len(shown.raw_commands) == 4 * (len(shown) - 1)
-    np.testing.assert_allclose(np.diff(shown.timestamps), 1 / 15)
-    assert 3.0 < shown.timestamps[-1] < 12.0
-    save_demonstration(tmp_path / "demo.h5", shown)
+    demo = record_demonstration(backend, peg_task, peg_model, device, config=BLIND)
+    assert demo.rates == rates and peg_task.achieved(demo.success, rates.record_hz)
+    assert len(demo.raw_commands) == 4 * (len(demo) - 1)
+    np.testing.assert_allclose(np.diff(demo.timestamps), 1 / 15)
+    assert 3.0 < demo.timestamps[-1] < 12.0
+    save_demonstration(tmp_path / "demo.h5", demo)
     assert load_demonstration(tmp_path / "demo.h5").rates == rates
-    annotation = suggest_annotation(shown, ExactWorld(shown, robot, peg_task.scene), [4])
-    attempt = RestoreExecutor(backend, [(shown, annotation)], AugmentConfig()).attempt(
+    annotation = suggest_annotation(demo, ExactWorld(demo, robot, peg_task.scene), [4])
+    attempt = RestoreExecutor(backend, [(demo, annotation)], AugmentConfig()).attempt(
         AttemptKey(0, 0, 0)
     )
     assert attempt.outcome == KEPT, attempt.detail
     # Two seconds, or as much longer as the joints need, in whole steps.
     duration = (attempt.episode.provenance.certificate or {})["duration"]
     assert len(attempt.episode) == round(15 * duration)
-    augment_demonstration(shown, annotation, make, tmp_path / "d", AugmentConfig(n=2))
+    augment_demonstration(demo, annotation, make, tmp_path / "d", AugmentConfig(n=2))
     assert validate_dataset(tmp_path / "d", robot, peg_task.scene).problems == {}
     backend.close()
 
@@ -291,5 +293,5 @@ def test_a_skill_that_acts_more_often_than_the_backend_is_commanded_is_refused(
 
 def test_films_need_a_drawing_ability_and_bodies_only(peg_demonstration, peg_backend, limited):
     stage = limited(peg_backend, Draws)
-    picture = SceneView(Playback("demo.h5", peg_demonstration), stage, "overview").picture(0, 24)
-    assert picture.shape == (24, 24, 3) and picture.std() > 5
+    image = SceneView(Playback("demo.h5", peg_demonstration), stage, "overview").image(0, 24)
+    assert image.shape == (24, 24, 3) and image.std() > 5

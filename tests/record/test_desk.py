@@ -1,4 +1,4 @@
-"""What a person's controls do, what they are asked again, and what they are told."""
+"""What a person's controls do, what they must confirm, and what they are told."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_a_question_is_forgotten_when_something_else_is_pressed(desk, saved):
     assert not saved and "again" in desk.notice.text
 
 
-def test_time_up_is_told(make_session, keyboard):
+def test_time_up_is_reported(make_session, keyboard):
     desk = recorded(RecordingDesk(make_session(seconds=1.0), keyboard, lambda _: None), 2.0)
     assert desk.session.state is SessionState.ENDED and desk.notice.text.startswith(
         "1 s are over. Goal"
@@ -126,16 +126,16 @@ def test_much_is_thrown_away_only_when_asked_twice(desk, saved, end_first):
     assert desk.done and not saved and desk.demonstration is None
 
 
-def test_after_a_discard_that_was_not_meant_it_goes_on(desk):
+def test_after_a_discard_that_was_not_meant_it_resumes(desk):
     recorded(desk, 4.0)
     desk.press(DISCARD)
     desk.press(NEXT)
     assert desk.session.state is SessionState.RECORDING
     desk.press(DISCARD)
-    assert not desk.done, "asked anew"
+    assert not desk.done, "asked again"
 
 
-def test_a_save_that_fails_loses_nothing_and_can_be_tried_again(
+def test_a_save_that_fails_loses_nothing_and_can_be_repeated(
     make_session, keyboard, tick_until, ended
 ):
     full, saved = [True], []
@@ -170,7 +170,7 @@ def test_seconds_spent_are_kept_with_the_demonstration(
     assert saved[0].seconds == pytest.approx(9.0)
 
 
-def test_trouble_and_contact_are_told_at_once(desk, keyboard, tick_until):
+def test_trouble_and_contact_are_reported_at_once(desk, keyboard, tick_until):
     desk.press(NEXT)
     keyboard.key("3", True)
     keyboard.key("q", True)
@@ -212,14 +212,14 @@ def test_a_device_lost_before_the_start_is_asked_for_at_the_start(desk, keyboard
     assert desk.session.state is SessionState.RECORDING
 
 
-def test_who_watches_is_told_of_each_step_and_each_phase(make_session, keyboard):
-    told = []
-    desk = RecordingDesk(make_session(), keyboard, lambda _: None, told.append)
+def test_who_watches_is_reported_of_each_step_and_each_phase(make_session, keyboard):
+    status = []
+    desk = RecordingDesk(make_session(), keyboard, lambda _: None, status.append)
     recorded(desk, 1.0)
     desk.press(NEXT)
-    phases = [row["state"] for row in told]
-    assert phases[:2] == ["ready", "recording"] and phases[-1] == "ended"
-    assert phases.count("recording") == 11
-    assert np.array(told[-1]["T_world_tool"]).shape == (4, 4)
-    seconds = [row["seconds"] for row in told]
-    assert seconds == sorted(seconds) and told[-1]["success"] is False
+    states = [row["state"] for row in status]
+    assert states[:2] == ["ready", "recording"] and states[-1] == "ended"
+    assert states.count("recording") == 11
+    assert np.array(status[-1]["T_world_tool"]).shape == (4, 4)
+    seconds = [row["seconds"] for row in status]
+    assert seconds == sorted(seconds) and status[-1]["success"] is False

@@ -56,7 +56,7 @@ def test_a_reversed_record_has_the_same_rows_in_the_opposite_order(recorder):
             np.testing.assert_array_equal(backward[name], values[::-1])
 
 
-def test_intrinsics_are_those_of_the_recorded_picture_size(recorder, peg_backend):
+def test_intrinsics_are_those_of_the_recorded_image_size(recorder, peg_backend):
     camera = recorder.steps().cameras["wrist"]
     height, width = camera.rgb.shape[1:3]
     assert (width, height) == peg_backend.image_size

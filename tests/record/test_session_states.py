@@ -147,8 +147,8 @@ def test_it_ends_by_itself_once_success_has_lasted(session, peg_task):
         held.append(session.success_held)
     assert session.end is End.SUCCESS and session.achieved
     assert session.success_held == pytest.approx(peg_task.hold)
-    shown = session.demonstration("p", "d", 1.0)
-    assert shown.success[-10:].all() and not shown.success[-11]
+    demo = session.demonstration("p", "d", 1.0)
+    assert demo.success[-10:].all() and not demo.success[-11]
     assert max(held) == held[-1]
 
 
@@ -195,7 +195,9 @@ def test_a_limited_joint_is_named_and_the_tool_stays(session):
     assert session.trouble == ""
 
 
-def test_out_of_reach_is_told_at_once_and_no_command_ever_jumps(peg_backend, peg_task, peg_model):
+def test_out_of_reach_is_reported_at_once_and_no_command_ever_jumps(
+    peg_backend, peg_task, peg_model
+):
     fastest = float(peg_model.spec.velocity_limits.min()) / 30
     config = SessionConfig((), 60, False, controller=ControllerConfig(max_joint_step=fastest))
     session = TeleopSession(peg_backend, peg_task, peg_model, config=config)
@@ -218,7 +220,7 @@ def test_out_of_reach_is_told_at_once_and_no_command_ever_jumps(peg_backend, peg
     assert np.linalg.norm(moved, axis=1).max() <= 0.3 / 10 + 1e-6
 
 
-def test_contact_is_told_with_its_pair_and_force_and_what_is_held_does_not_count(session):
+def test_contact_is_reported_with_its_pair_and_force_and_what_is_held_does_not_count(session):
     session.start()
     assert session.contacts == []
     # Beside the hole and down on its rim.

@@ -1,4 +1,4 @@
-"""The recording's window: pacing, keys and pictures, on SDL's display that isn't there."""
+"""The recording's window: pacing, keys and images, on SDL's display that isn't there."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def press(pygame, key, *kinds):
         pygame.event.post(pygame.event.Event(kind, key=key))
 
 
-def test_events_are_told_by_the_names_of_keys(pygame, screen):
+def test_events_have_the_names_of_keys(pygame, screen):
     press(pygame, pygame.K_RIGHT, pygame.KEYDOWN)
     press(pygame, pygame.K_w, pygame.KEYUP)
     pygame.event.post(pygame.event.Event(pygame.WINDOWFOCUSLOST))
@@ -91,13 +91,13 @@ def test_events_are_told_by_the_names_of_keys(pygame, screen):
     assert list(screen.events()) == [Key("right", True), Key("w", False), FocusLost(), Closed()]
 
 
-def test_every_phase_looks_different_and_shows_the_scene(pygame, window):
-    pictures = {}
+def test_every_state_looks_different_and_shows_the_scene(pygame, window):
+    images = {}
 
     def look():
         window.draw()
-        picture = pygame.surfarray.array3d(window._screen._canvas)
-        pictures[window._desk.session.state] = picture
+        image = pygame.surfarray.array3d(window._screen._canvas)
+        images[window._desk.session.state] = image
 
     look()
     window._take(Key("right", True))
@@ -112,12 +112,12 @@ def test_every_phase_looks_different_and_shows_the_scene(pygame, window):
     window._take(Key("right", True))
     window._take(Key("right", True))
     look()
-    assert set(pictures) == set(SessionState)
-    heads = [picture[800:1264, 76:128] for picture in pictures.values()]
+    assert set(images) == set(SessionState)
+    heads = [image[800:1264, 76:128] for image in images.values()]
     for i, a in enumerate(heads):
         assert all((a != b).any() for b in heads[i + 1 :])
-    for picture in pictures.values():
-        scene = picture[16:784, 16:784].reshape(-1, 3)
+    for image in images.values():
+        scene = image[16:784, 16:784].reshape(-1, 3)
         assert len(np.unique(scene, axis=0)) > 20
 
 
@@ -155,14 +155,14 @@ def test_closing_the_window_asks_before_much_is_lost(pygame, window):
     assert window._desk.done
 
 
-def test_a_picture_that_takes_long_gets_smaller_and_one_that_is_quick_larger(window, monkeypatch):
+def test_an_image_that_takes_long_gets_smaller_and_one_that_is_quick_larger(window, monkeypatch):
     window._take(Key("right", True))
     for limit, at in (("_SLOW", 0), ("_QUICK", 4)):
         monkeypatch.setattr("sart_toolkit.record.window._SLOW", 1e9)
         monkeypatch.setattr("sart_toolkit.record.window._QUICK", 0.0)
         monkeypatch.setattr(f"sart_toolkit.record.window.{limit}", 0.0 if at == 0 else 1e9)
         for _ in range(6):
-            window._scene_picture()
+            window._scene_image()
         assert window._size == at
 
 
@@ -182,7 +182,7 @@ def test_words_too_long_for_their_box_end_in_an_ellipsis(pygame, screen, monkeyp
 
 
 @pytest.mark.parametrize("display", [None, ":987"])
-def test_without_a_display_the_remedy_is_told(monkeypatch, display):
+def test_without_a_display_the_remedy_is_reported(monkeypatch, display):
     pytest.importorskip("pygame")
     for name in ("SDL_VIDEODRIVER", "WAYLAND_DISPLAY", "DISPLAY"):
         monkeypatch.delenv(name, raising=False)

@@ -33,17 +33,17 @@ RADII = (0.08, 0.045, 0.02)
 PAIRS = ("gripper - table", "peg - block", "peg - block")
 
 
-def wrist_pictures(p_world_tool: Array, size: int = 48) -> Image:
+def wrist_images(p_world_tool: Array, size: int = 48) -> Image:
     """What a camera above a table with a dark square hole might see from `p_world_tool (n, 3)`."""
     y, x = np.mgrid[:size, :size] / size - 0.5
-    pictures = np.empty((len(p_world_tool), size, size, 3), np.uint8)
-    for picture, p in zip(pictures, p_world_tool, strict=True):
+    images = np.empty((len(p_world_tool), size, size, 3), np.uint8)
+    for image, p in zip(images, p_world_tool, strict=True):
         half = 0.012 / max(p[2], 0.05)
-        picture[:] = (np.array([176, 150, 118]) + 30 * (x + y)[..., None]).astype(np.uint8)
+        image[:] = (np.array([176, 150, 118]) + 30 * (x + y)[..., None]).astype(np.uint8)
         hole = (np.abs(x + 1.5 * p[0] - 0.75) < half) & (np.abs(y + 1.5 * p[1]) < half)
-        picture[hole] = (38, 36, 40)
-        picture[size - size // 6 :, size // 3 : -size // 3] = (200, 60, 50)
-    return pictures
+        image[hole] = (38, 36, 40)
+        image[size - size // 6 :, size // 3 : -size // 3] = (200, 60, 50)
+    return images
 
 
 def make_steps(p_world_tool: Array, size: int = 48) -> Steps:
@@ -51,7 +51,7 @@ def make_steps(p_world_tool: Array, size: int = 48) -> Steps:
     n = len(p_world_tool)
     Ts = np.array([pose(p, (np.pi, 0, 0)) for p in p_world_tool])
     camera = CameraRecord(
-        rgb=wrist_pictures(p_world_tool, size),
+        rgb=wrist_images(p_world_tool, size),
         depth=np.full((n, size, size), 0.2, np.float32),
         intrinsics=np.diag([50.0, 50.0, 1.0]),
         frame="tool",
@@ -199,10 +199,10 @@ def make_run(path: Path) -> Path:
     )
     storage.write_json(path / "evaluation.json", make_evaluation())
     for outcome, episode in (("success", 0), ("failure", 6)):
-        pictures = wrist_pictures(source.demonstration.steps.measured_Ts_world_tool[:, :3, 3], 120)
+        images = wrist_images(source.demonstration.steps.measured_Ts_world_tool[:, :3, 3], 120)
         frames = (
-            caption(picture, episode, t / 10, outcome)  # type: ignore[arg-type]
-            for t, picture in enumerate(pictures[:8])
+            caption(image, episode, t / 10, outcome)  # type: ignore[arg-type]
+            for t, image in enumerate(images[:8])
         )
         write_video(path / "videos" / f"{outcome}_000.mp4", frames, 10)
     storage.write_json(

@@ -18,8 +18,8 @@ from sart_toolkit.report.figures import (
     SPHERE_COLOURS,
     SegmentPath,
     film_strip,
-    placement_picture,
-    scene_picture,
+    placement_image,
+    scene_image,
     segment_paths,
     sphere_colour,
     training_curve,
@@ -40,7 +40,7 @@ def shows(png: bytes, colour: str) -> bool:
     return bool((pixels(png) == wanted).all(axis=2).any())
 
 
-def test_film_strip_shows_first_and_last_picture(demonstration: Demonstration) -> None:
+def test_film_strip_shows_first_and_last_image(demonstration: Demonstration) -> None:
     rgb = demonstration.steps.cameras["wrist"].rgb
     strip = pixels(film_strip(demonstration, n=5, size=48))
     assert strip.shape[0] > 48 and strip.shape[1] == 1 + 5 * 49
@@ -48,7 +48,7 @@ def test_film_strip_shows_first_and_last_picture(demonstration: Demonstration) -
     assert (strip[1:49, -49:-1] == rgb[-1]).all()
 
 
-def test_film_strip_takes_at_most_one_picture_a_step(demonstration: Demonstration) -> None:
+def test_film_strip_takes_at_most_one_image_a_step(demonstration: Demonstration) -> None:
     n = len(demonstration)
     assert film_strip(demonstration, n=n, size=32) == film_strip(demonstration, n=10 * n, size=32)
 
@@ -57,7 +57,7 @@ def test_film_strip_takes_at_most_one_picture_a_step(demonstration: Demonstratio
     ("changes", "error", "message"),
     [
         ({"camera": "wirst"}, UnknownName, "unknown camera 'wirst': did you mean 'wrist'"),
-        ({"n": 1}, InvalidInput, "n: expected at least 2 pictures, got 1"),
+        ({"n": 1}, InvalidInput, "n: expected at least 2 images, got 1"),
         ({"size": 8}, InvalidInput, "size: expected at least 32 pixels, got 8"),
     ],
 )
@@ -88,7 +88,7 @@ def test_segment_path_is_checked_and_read_only() -> None:
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_scene_shows_every_sphere_in_its_colour(dataset: Dataset, theme: Any) -> None:
-    png = scene_picture(
+    png = scene_image(
         dataset.sources[0].demonstration,
         dataset.sources[0].annotation,
         segment_paths(dataset),
@@ -104,8 +104,8 @@ def test_scene_is_as_wide_as_high_for_a_sphere(dataset: Dataset) -> None:
     # Equal aspect: the outline of a sphere alone is a circle.
     sphere = dataclasses.replace(dataset.sources[0].annotation.spheres[1], radius=0.15)
     alone = Annotation((sphere,), dataset.sources[0].annotation.demonstration_hash)
-    picture = pixels(scene_picture(dataset.sources[0].demonstration, alone))
-    left = picture[:, : picture.shape[1] // 2].astype(int)
+    image = pixels(scene_image(dataset.sources[0].demonstration, alone))
+    left = image[:, : image.shape[1] // 2].astype(int)
     tinted = left[: int(0.8 * len(left)), :, 2] - left[: int(0.8 * len(left)), :, 0] > 25
     height, width = (int(np.ptp(np.flatnonzero(tinted.any(axis=axis)))) for axis in (1, 0))
     assert height > 100
@@ -113,14 +113,14 @@ def test_scene_is_as_wide_as_high_for_a_sphere(dataset: Dataset) -> None:
 
 
 def test_scene_needs_neither_spheres_nor_paths(demonstration: Demonstration) -> None:
-    assert pixels(scene_picture(demonstration)).std() > 5
+    assert pixels(scene_image(demonstration)).std() > 5
 
 
 def test_scene_shows_spheres_too_small_for_the_whole_close_up(dataset: Dataset) -> None:
     first, *others = dataset.sources[0].annotation.spheres
     small = [dataclasses.replace(sphere, radius=0.004) for sphere in others]
     annotation = Annotation((first, *small), dataset.sources[0].annotation.demonstration_hash)
-    png = scene_picture(dataset.sources[0].demonstration, annotation, segment_paths(dataset))
+    png = scene_image(dataset.sources[0].demonstration, annotation, segment_paths(dataset))
     half = pixels(png)[:, pixels(png).shape[1] // 2 :].astype(int)
     # Bluish green: the third sphere's tinted disc is large although its radius is 4 mm.
     greenish = (half[..., 1] - half[..., 0] > 20) & (half[..., 1] - half[..., 2] > 5)
@@ -129,7 +129,7 @@ def test_scene_shows_spheres_too_small_for_the_whole_close_up(dataset: Dataset) 
 
 def test_scene_refuses_paths_of_another_annotation(dataset: Dataset) -> None:
     with pytest.raises(InvalidInput, match="belongs to sphere 7, the annotation has 3"):
-        scene_picture(
+        scene_image(
             dataset.sources[0].demonstration,
             dataset.sources[0].annotation,
             [SegmentPath(7, np.zeros((2, 3)))],
@@ -163,22 +163,22 @@ def test_training_curve_refuses(epochs: Any, losses: Any, message: str) -> None:
 
 
 def test_placements_are_coloured_by_outcome() -> None:
-    both = placement_picture(PLACES, OUTCOMES)
-    only = placement_picture(PLACES, ["success"] * 4)
+    both = placement_image(PLACES, OUTCOMES)
+    only = placement_image(PLACES, ["success"] * 4)
     assert not np.array_equal(pixels(both), pixels(only))
 
 
 def test_placements_show_the_demonstration_and_each_object() -> None:
-    one = placement_picture(PLACES, OUTCOMES)
-    marked = placement_picture(PLACES, OUTCOMES, {"block": {"x": 0.0, "y": 0.0}})
+    one = placement_image(PLACES, OUTCOMES)
+    marked = placement_image(PLACES, OUTCOMES, {"block": {"x": 0.0, "y": 0.0}})
     assert pixels(marked).shape == pixels(one).shape
     assert not np.array_equal(pixels(marked), pixels(one))
-    two = placement_picture([{**p, "cup": {"x": 0, "y": 0}} for p in PLACES], OUTCOMES)
+    two = placement_image([{**p, "cup": {"x": 0, "y": 0}} for p in PLACES], OUTCOMES)
     assert pixels(two).shape[1] // 2 == pixels(one).shape[1]
 
 
 def test_one_placement_alone_is_drawn() -> None:
-    assert pixels(placement_picture(PLACES[:1], OUTCOMES[:1], theme="dark")).std() > 5
+    assert pixels(placement_image(PLACES[:1], OUTCOMES[:1], theme="dark")).std() > 5
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_one_placement_alone_is_drawn() -> None:
 )
 def test_placements_refuse(places: Any, outcomes: Any, message: str) -> None:
     with pytest.raises(InvalidInput, match=message):
-        placement_picture(places, outcomes)
+        placement_image(places, outcomes)
 
 
 def test_unknown_theme_is_refused() -> None:

@@ -67,7 +67,7 @@ def written(run_dir: Path) -> Page:
 @pytest.fixture(autouse=True)
 def _quick_drawings(monkeypatch: pytest.MonkeyPatch, small_png: bytes) -> None:
     """Drawings are tested beside; only `page`, made before this, shows real ones."""
-    for name in ("scene_picture", "training_curve", "placement_picture"):
+    for name in ("scene_image", "training_curve", "placement_image"):
         monkeypatch.setattr(report, name, lambda *_: small_png)
 
 
@@ -94,7 +94,7 @@ def test_page_asks_nothing_of_any_network(page: Page) -> None:
     assert len(policies) == 1 and policies[0].startswith("default-src 'none'")
 
 
-def test_page_carries_its_pictures_and_videos(page: Page, _finished_run: Path) -> None:
+def test_page_carries_its_images_and_videos(page: Page, _finished_run: Path) -> None:
     videos = [v["src"] for v in page.all("video")]
     expected = [
         (_finished_run / "videos" / f"{name}_000.mp4").read_bytes()
@@ -215,7 +215,7 @@ def test_evaluation_without_videos_or_placements_is_shown(
     assert "The evaluation made no videos." in written(run_dir).text
 
 
-def test_demonstration_without_pictures_leaves_a_note(
+def test_demonstration_without_images_leaves_a_note(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load = report.load_demonstration
@@ -227,7 +227,7 @@ def test_demonstration_without_pictures_leaves_a_note(
 
     monkeypatch.setattr(report, "load_demonstration", blind)
     (run_dir / "annotation.json").unlink()
-    assert "The demonstration holds no camera pictures." in written(run_dir).text
+    assert "The demonstration holds no camera images." in written(run_dir).text
 
 
 def test_large_videos_are_named_instead_of_carried(
@@ -332,7 +332,7 @@ def test_durations_read_naturally(seconds: float, words: str) -> None:
     assert duration(seconds).replace("\N{NO-BREAK SPACE}", " ") == words
 
 
-def test_shares_read_naturally() -> None:
+def test_percentages_read_naturally() -> None:
     shares = [percent(share).replace("\N{NO-BREAK SPACE}", " ") for share in (0, 0.8, 0.9287, 1)]
     assert shares == ["0 %", "80 %", "92.9 %", "100 %"]
 

@@ -1,4 +1,4 @@
-"""Playing a recording: which pictures and facts belong to which step."""
+"""Playing a recording: which images and facts belong to which step."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_a_demonstration_is_played_from_its_first_step_to_its_last(
     assert len(demonstration) == len(peg_demonstration) and demonstration.split == 0
     assert demonstration.seconds == pytest.approx(peg_demonstration.timestamps[-1])
     for i in (0, 7, len(demonstration) - 1):
-        picture = peg_demonstration.steps.cameras["wrist"].rgb[i]
-        np.testing.assert_array_equal(demonstration.picture(i), picture)
+        image = peg_demonstration.steps.cameras["wrist"].rgb[i]
+        np.testing.assert_array_equal(demonstration.image(i), image)
         assert demonstration.waypoint(i) == i and demonstration.part(i) == "demonstration"
         assert demonstration.force(i) == peg_demonstration.steps.contact_force[i]
         assert demonstration.success(i) == peg_demonstration.success[i]
@@ -51,28 +51,28 @@ def test_a_demonstration_is_played_from_its_first_step_to_its_last(
 def test_an_episode_is_its_segment_and_then_the_demonstration_from_where_it_joins(
     episode, peg_dataset
 ):
-    made, shown = peg_dataset.episode(0), peg_dataset.sources[0].demonstration
+    made, demo = peg_dataset.episode(0), peg_dataset.sources[0].demonstration
     t_star = made.provenance.t_star
     n = len(made)
-    assert len(episode) == n + len(shown) - t_star and episode.split == n
+    assert len(episode) == n + len(demo) - t_star and episode.split == n
     assert episode.part(n - 1) == "segment" and episode.part(n) == "demonstration"
-    np.testing.assert_array_equal(episode.picture(0), made.steps.cameras["wrist"].rgb[0])
-    np.testing.assert_array_equal(episode.picture(n), shown.steps.cameras["wrist"].rgb[t_star])
+    np.testing.assert_array_equal(episode.image(0), made.steps.cameras["wrist"].rgb[0])
+    np.testing.assert_array_equal(episode.image(n), demo.steps.cameras["wrist"].rgb[t_star])
     assert episode.waypoint(0) == episode.waypoint(n) == t_star
-    assert episode.waypoint(len(episode) - 1) == len(shown) - 1
+    assert episode.waypoint(len(episode) - 1) == len(demo) - 1
     assert not any(episode.success(i) for i in range(n)) and episode.success(len(episode) - 1)
 
 
 def test_the_scene_is_drawn_with_the_robot_where_it_was(demonstration, peg_backend):
     scene = SceneView(demonstration, peg_backend, "overview")
-    shown = demonstration.demonstration
+    demo = demonstration.demonstration
     last = len(demonstration) - 1
     for i in (0, last):
-        drawn = scene.picture(i, 64)
-        peg_backend.restore(shown.states[i])
+        drawn = scene.image(i, 64)
+        peg_backend.restore(demo.states[i])
         exact = peg_backend.observe(("overview",), 64).cameras["overview"].rgb
         assert np.abs(drawn.astype(int) - exact).mean() < 0.5
-    assert (scene.picture(0, 64) != scene.picture(last, 64)).any()
+    assert (scene.image(0, 64) != scene.image(last, 64)).any()
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def drawn_states(monkeypatch):
 def test_a_segment_s_robot_is_where_its_joints_were(
     episode, peg_backend, peg_model, peg_dataset, drawn_states
 ):
-    SceneView(episode, peg_backend, "overview").picture(0, 32)
+    SceneView(episode, peg_backend, "overview").image(0, 32)
     measured = peg_dataset.episode(0).steps.measured_Ts_world_tool[0]
     np.testing.assert_allclose(peg_model.fk(drawn_states[0].q), measured, atol=1e-6)
 
@@ -100,9 +100,9 @@ def test_a_scene_is_drawn_by_a_backend_that_can_do_nothing_else(
     demonstration, peg_backend, limited
 ):
     stage = limited(peg_backend, Draws)
-    expected = SceneView(demonstration, peg_backend, "overview").picture(3, 32)
+    expected = SceneView(demonstration, peg_backend, "overview").image(3, 32)
     np.testing.assert_array_equal(
-        SceneView(demonstration, stage, "overview").picture(3, 32), expected
+        SceneView(demonstration, stage, "overview").image(3, 32), expected
     )
 
 
@@ -120,18 +120,18 @@ def test_what_is_carried_moves_with_the_tool_in_a_segment(tmp_path, drawn_states
     backend, model = make(), RobotModel(robot, task.scene.held)
     plan = task.plan(task.initial_state(model, Placement()))
     operator = ScriptedOperator(plan, np.random.default_rng(0))
-    shown = record_demonstration(backend, task, model, operator)
-    scene = ExactWorld(shown, robot, task.scene)
-    carried = [t for t, phase in enumerate(scene.phases) if phase.grasped]
-    spheres = suggest_annotation(shown, scene, [carried[len(carried) // 2]])
-    made = augment_demonstration(shown, spheres, make, tmp_path / "d", AugmentConfig(n=2))
-    playback = Playback("episode.h5", shown, made.episode(0))
-    SceneView(playback, backend, "overview").picture(0, 32)
+    demo = record_demonstration(backend, task, model, operator)
+    scene = ExactWorld(demo, robot, task.scene)
+    grasped = [t for t, phase in enumerate(scene.phases) if phase.grasped]
+    spheres = suggest_annotation(demo, scene, [grasped[len(grasped) // 2]])
+    made = augment_demonstration(demo, spheres, make, tmp_path / "d", AugmentConfig(n=2))
+    playback = Playback("episode.h5", demo, made.episode(0))
+    SceneView(playback, backend, "overview").image(0, 32)
     (now,) = drawn_states
     T_world_tool = model.fk(now.q)
     t = playback.waypoint(0)
     (name,) = scene.phases[t].grasped
-    was = np.linalg.inv(shown.steps.measured_Ts_world_tool[t]) @ shown.body_Ts_world[name][t]
+    was = np.linalg.inv(demo.steps.measured_Ts_world_tool[t]) @ demo.body_Ts_world[name][t]
     np.testing.assert_allclose(
         np.linalg.inv(T_world_tool) @ now.Ts_world_body[name], was, atol=1e-4
     )
@@ -159,9 +159,9 @@ def test_a_demonstration_that_does_not_tell_where_bodies_were_has_no_scene_view(
         SceneView(Playback("demo.h5", blind), peg_backend, "overview")
 
 
-def test_a_demonstration_without_pictures_can_t_be_played(peg_demonstration):
+def test_a_demonstration_without_images_can_t_be_played(peg_demonstration):
     steps = dataclasses.replace(peg_demonstration.steps, cameras={})
-    with pytest.raises(InvalidInput, match="holds no pictures"):
+    with pytest.raises(InvalidInput, match="holds no images"):
         Playback("demo.h5", dataclasses.replace(peg_demonstration, steps=steps))
 
 

@@ -17,12 +17,12 @@ from sart_toolkit.evaluate.rollout import Moment
 from sart_toolkit.report.video import caption, check_frame, film_rollout, font, inset, write_video
 
 
-def pictures(n: int, height: int = 64, width: int = 96) -> Iterator[Image]:
-    """Grey pictures with a white bar that moves right."""
+def images(n: int, height: int = 64, width: int = 96) -> Iterator[Image]:
+    """Grey images with a white bar that moves right."""
     for t in range(n):
-        picture = np.full((height, width, 3), 90, np.uint8)
-        picture[:, 4 * t : 4 * t + 8] = 255
-        yield picture
+        image = np.full((height, width, 3), 90, np.uint8)
+        image[:, 4 * t : 4 * t + 8] = 255
+        yield image
 
 
 def grey(height: int, width: int, value: int = 90) -> Image:
@@ -62,11 +62,11 @@ def boxes(content: bytes) -> list[bytes]:
 
 def test_video_decodes_to_what_was_written(tmp_path: Path) -> None:
     path = tmp_path / "videos" / "a.mp4"
-    assert write_video(path, pictures(12), fps=10) == 12
+    assert write_video(path, images(12), fps=10) == 12
     decoded = decode(path, 64, 96)
     assert decoded.shape == (12, 64, 96, 3)
-    for t, picture in enumerate(pictures(12)):
-        assert np.abs(decoded[t].astype(int) - picture).mean() < 4
+    for t, image in enumerate(images(12)):
+        assert np.abs(decoded[t].astype(int) - image).mean() < 4
     assert os.listdir(path.parent) == ["a.mp4"]
 
 
@@ -88,7 +88,7 @@ def test_a_rollout_s_film_shows_outside_wrist_and_outcome_at_each_moment(
 
 def test_video_is_what_browsers_play(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
-    write_video(path, pictures(12), fps=10)
+    write_video(path, images(12), fps=10)
     for words in ("Video: h264", "yuv420p(tv, bt709", " 10 fps", "Duration: 00:00:01.20"):
         assert words in probe(path)
     order = boxes(path.read_bytes())
@@ -112,7 +112,7 @@ def test_odd_sizes_are_padded_to_even_ones(tmp_path: Path) -> None:
 
 def test_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.mp4", "b.mp4"):
-        write_video(tmp_path / name, pictures(5), fps=10)
+        write_video(tmp_path / name, images(5), fps=10)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
 
 
@@ -121,7 +121,7 @@ def test_failure_on_the_way_leaves_what_was_there(tmp_path: Path) -> None:
     path.write_bytes(b"before")
 
     def broken() -> Iterator[Image]:
-        yield from pictures(3)
+        yield from images(3)
         raise RuntimeError("camera unplugged")
 
     with pytest.raises(RuntimeError, match="camera unplugged"):
@@ -133,7 +133,7 @@ def test_failure_on_the_way_leaves_what_was_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("frames", "changes", "message"),
     [
-        ([], {}, "no frames to write; pass at least one picture"),
+        ([], {}, "no frames to write; pass at least one image"),
         ([np.zeros((8, 8), np.uint8)], {}, r"frame 0: expected uint8 of shape \(H, W, 3\)"),
         ([np.zeros((8, 8, 4), np.uint8)], {}, r"frame 0: .*got uint8 \(8, 8, 4\)"),
         ([np.zeros((8, 8, 3))], {}, r"frame 0: .*got float64 \(8, 8, 3\)"),
@@ -164,7 +164,7 @@ def test_ffmpeg_that_fails_is_reported_with_its_reason(
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(fake))
     out = tmp_path / "out"
     with pytest.raises(CannotWrite, match=r"could not write the video \(No space left on device"):
-        write_video(out / "a.mp4", pictures(50, 240, 320), fps=10)
+        write_video(out / "a.mp4", images(50, 240, 320), fps=10)
     assert os.listdir(out) == []
 
 
@@ -174,7 +174,7 @@ def test_missing_ffmpeg_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
     with pytest.raises(MissingExtra, match="pip install --force-reinstall imageio-ffmpeg"):
-        write_video(tmp_path / "a.mp4", pictures(3), fps=10)
+        write_video(tmp_path / "a.mp4", images(3), fps=10)
 
 
 def test_inset_shows_the_wrist_in_its_corner_and_leaves_the_rest() -> None:
@@ -191,7 +191,7 @@ def test_inset_shows_the_wrist_in_its_corner_and_leaves_the_rest() -> None:
 
 
 @pytest.mark.parametrize("corner", ["top left", "top right", "bottom left", "bottom right"])
-def test_inset_goes_where_it_is_told(corner: Any) -> None:
+def test_inset_goes_where_it_is_reported(corner: Any) -> None:
     frame = grey(240, 320)
     changed = (inset(frame, grey(64, 96, 20), corner=corner) != frame).any(axis=2)
     y, x = np.argwhere(changed).mean(axis=0)
@@ -199,7 +199,7 @@ def test_inset_goes_where_it_is_told(corner: Any) -> None:
     assert (x < 160) == corner.endswith("left")
 
 
-def test_inset_keeps_the_wrist_pictures_proportions() -> None:
+def test_inset_keeps_the_wrist_images_proportions() -> None:
     frame = grey(240, 320)
     changed = (inset(frame, grey(40, 80, 20), label="") != frame).any(axis=2)
     height, width = (int(changed.any(axis=axis).sum()) for axis in (1, 0))
@@ -213,7 +213,7 @@ def test_inset_label_appears_only_where_it_fits() -> None:
     assert (inset(frame, wrist, label="far too many words " * 9) == unlabelled).all()
 
 
-def test_caption_adds_a_strip_below_and_leaves_the_picture() -> None:
+def test_caption_adds_a_strip_below_and_leaves_the_image() -> None:
     frame = grey(240, 320)
     result = caption(frame, 3, 2.5, "success", "block at +31 mm")
     assert result.shape[1:] == (320, 3) and result.shape[0] > 240
@@ -248,7 +248,7 @@ def test_text_is_drawn_with_every_letter_it_may_need() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: check_frame("picture", np.zeros(3, np.uint8)), r"picture: .*got uint8 \(3,\)"),
+        (lambda: check_frame("image", np.zeros(3, np.uint8)), r"image: .*got uint8 \(3,\)"),
         (lambda: inset(np.zeros((8, 8, 3)), grey(4, 4)), "frame: expected uint8"),
         (lambda: inset(grey(8, 8), np.zeros((4, 4, 3))), "wrist: expected uint8"),
         (lambda: inset(grey(8, 8), grey(4, 4), fraction=1.0), "fraction: expected between 0 and 1"),

@@ -1,4 +1,4 @@
-"""Kinematics: IK inverts FK within joint limits, and what can't be answered is told."""
+"""Kinematics: IK inverts FK within joint limits, and what can't be answered is refused."""
 
 import dataclasses
 
@@ -162,7 +162,7 @@ def test_ik_of_what_is_no_pose_is_refused(model, T):
         model.ik(T, model.spec.home)
 
 
-def test_an_unknown_frame_is_told_with_the_nearest_name(model):
+def test_an_unknown_frame_is_reported_with_the_nearest_name(model):
     for ask in (model.fk, model.jacobian):
         with pytest.raises(UnknownName, match="unknown frame 'toool': did you mean 'tool'"):
             ask(model.spec.home, "toool")
@@ -184,7 +184,7 @@ def test_a_robot_of_other_urdfs_needs_only_its_spec(make_tiny):
     np.testing.assert_allclose(T, pose([0, 0, 0.7], [0, 0, np.pi / 2]), atol=1e-9)
 
 
-def test_an_arm_joint_that_the_urdf_lacks_is_told_with_the_nearest_name(make_tiny):
+def test_an_arm_joint_that_the_urdf_lacks_is_reported_with_the_nearest_name(make_tiny):
     spec = make_tiny(arm_joints=("shoulder", "wrst"))
     with pytest.raises(UnknownName, match="unknown joint 'wrst': did you mean 'wrist'"):
         RobotModel(spec)
@@ -201,18 +201,18 @@ def test_arm_joints_in_another_order_are_refused(make_tiny):
     [{"driver": "gripper_fingr_joint"}, {"followers": {"gripper_fingr_joint": 1.0}}],
     ids=["driver", "follower"],
 )
-def test_a_gripper_joint_that_the_urdf_lacks_is_told_with_the_nearest_name(make_tiny, change):
+def test_a_gripper_joint_that_the_urdf_lacks_is_reported_with_the_nearest_name(make_tiny, change):
     with pytest.raises(UnknownName, match="'gripper_fingr_joint': did you mean 'gripper_finger_j"):
         RobotModel(make_tiny(gripper=change))
 
 
-def test_a_body_held_by_an_unknown_frame_is_told_with_the_nearest_name(make_tiny):
+def test_a_body_held_by_an_unknown_frame_is_reported_with_the_nearest_name(make_tiny):
     held = Attachment("peg", "toool", (Shape("box", (0.01, 0.01, 0.01)),))
     with pytest.raises(UnknownName, match="'toool': did you mean 'tool'"):
         RobotModel(make_tiny(), (held,))
 
 
-def test_a_gripper_on_an_unknown_frame_is_told_with_the_nearest_name(make_tiny):
+def test_a_gripper_on_an_unknown_frame_is_reported_with_the_nearest_name(make_tiny):
     with pytest.raises(UnknownName, match="'flang': did you mean 'flange'"):
         RobotModel(make_tiny(gripper={"parent_frame": "flang"}))
 

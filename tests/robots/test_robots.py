@@ -1,4 +1,4 @@
-"""The table of robots: each one loads under its name, another name is told with the nearest."""
+"""The table of robots: each one loads under its name, another name is refused with the nearest."""
 
 import pytest
 
@@ -26,7 +26,7 @@ def test_every_robot_can_reach_its_home_pose_from_beside_it(name):
     assert abs(model.fk(model.ik(T, spec.home + 0.05)) - T).max() < 1e-5
 
 
-def test_an_unknown_robot_is_told_with_the_nearest_name():
+def test_an_unknown_robot_is_reported_with_the_nearest_name():
     with pytest.raises(UnknownName, match="unknown robot 'ur5_2f85': did you mean 'ur5e_2f85'"):
         get_robot("ur5_2f85")
     with pytest.raises(UnknownName, match="unknown robot 'hal': choose from .*ur5e_2f85"):

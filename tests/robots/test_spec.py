@@ -101,12 +101,12 @@ def test_a_camera_at_what_is_no_pose_is_refused():
 
 @PROPERTY
 @given(st.floats(1, 170), st.integers(1, 500), st.integers(1, 500))
-def test_intrinsics_put_the_field_of_view_at_the_pictures_edges(fov, width, height):
+def test_intrinsics_put_the_field_of_view_at_the_images_edges(fov, width, height):
     K = CameraSpec("wrist", "tool", np.eye(4), fov_y_deg=fov).intrinsics(width, height)
     rise = np.tan(np.deg2rad(fov) / 2)
     for direction, row in ((rise, height - 0.5), (-rise, -0.5)):
         u, v, w = K @ [0, direction, 1]
-        # (0, 0) is the centre of the first pixel, so the picture spans -0.5 to height - 0.5.
+        # (0, 0) is the centre of the first pixel, so the image spans -0.5 to height - 0.5.
         assert (u / w, v / w) == pytest.approx(((width - 1) / 2, row), abs=1e-6 * height)
     assert K[0, 0] == K[1, 1]
 
@@ -178,7 +178,7 @@ def test_a_resource_of_a_missing_package_says_how_to_install_it(package):
         resource_path(f"{package}:robot.urdf")
 
 
-def test_a_missing_resource_is_told(tmp_path):
+def test_a_missing_resource_is_reported(tmp_path):
     with pytest.raises(MissingFile, match=r"airo_models:x.urdf: no such file \(x.urdf\)"):
         resource_path("airo_models:x.urdf")
     with pytest.raises(MissingFile, match="no such file"):
@@ -189,7 +189,7 @@ def test_a_missing_resource_is_told(tmp_path):
     ("given", "size"),
     [(64, (64, 64)), ("64", (64, 64)), ("160x120", (160, 120)), ((160, 120), (160, 120))],
 )
-def test_a_picture_s_size_is_a_number_or_width_and_height(given, size):
+def test_an_image_s_size_is_a_number_or_width_and_height(given, size):
     assert check_image_size(given) == size
     assert check_image_size(np.array(given) if isinstance(given, tuple) else given) == size
 

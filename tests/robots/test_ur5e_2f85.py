@@ -69,7 +69,7 @@ def test_the_wrist_camera_sees_both_fingertips_and_what_lies_beyond_them(spec, p
         assert 0 <= v / w <= 127
 
 
-def test_the_cameras_housing_is_behind_its_picture(spec):
+def test_the_cameras_housing_is_behind_its_image(spec):
     corners = np.concatenate([shape.corners() for shape in spec.attachments[0].shapes])
     assert spec.attachments[0].name == "wrist_camera"
     assert isinstance(spec.attachments[0].shapes[0], Shape)

@@ -260,7 +260,7 @@ def test_another_process_may_have_made_the_same_urdf_meanwhile(make_tiny, own_ca
 
 
 @pytest.mark.parametrize("step", ["mkdir", "replace"])
-def test_a_cache_that_can_not_be_written_is_told_and_left_clean(
+def test_a_cache_that_can_not_be_written_is_reported_and_left_clean(
     make_tiny, own_cache, monkeypatch, step
 ):
     if step == "mkdir":
@@ -280,7 +280,7 @@ def test_a_cache_that_can_not_be_written_is_told_and_left_clean(
 # --- sources that can't be used -----------------------------------------------------------------
 
 
-def test_a_missing_source_is_told(make_tiny, tmp_path):
+def test_a_missing_source_is_reported(make_tiny, tmp_path):
     with pytest.raises(MissingFile, match="nowhere.urdf: no such file"):
         composed_urdf(make_tiny(urdf=str(tmp_path / "nowhere.urdf")))
     with pytest.raises(MissingExtra, match="pip install no_such_package"):

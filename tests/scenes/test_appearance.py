@@ -1,4 +1,4 @@
-"""Other looks: within what was asked for, the same for a seed, and nothing else changes."""
+"""Other appearance: within what was asked for, the same for a seed, and nothing else changes."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import distance
 from sart_toolkit.robots import get_robot
-from sart_toolkit.scenes.appearance import AppearanceConfig, vary_appearance
+from sart_toolkit.scenes.appearance import AppearanceConfig, randomise_appearance
 from sart_toolkit.tasks import TASKS, get_task
 
 
@@ -18,10 +18,10 @@ def task(request):
     return get_task(request.param)
 
 
-def test_looks_vary_within_what_was_asked_for(task):
+def test_the_appearance_varies_within_what_was_asked_for(task):
     robot, config = get_robot(task.robot), AppearanceConfig()
     for seed in range(20):
-        varied, scene = vary_appearance(robot, task.scene, np.random.default_rng(seed))
+        varied, scene = randomise_appearance(robot, task.scene, np.random.default_rng(seed))
         for old, new in zip(task.scene.bodies, scene.bodies, strict=True):
             colours = np.array([[s.rgba for s in body.shapes] for body in (old, new)])
             assert np.abs(colours[0] - colours[1]).max() <= config.colour + 1e-12
@@ -37,9 +37,9 @@ def test_looks_vary_within_what_was_asked_for(task):
         assert 0 < np.rad2deg(turn) <= np.sqrt(3) * config.camera_deg
 
 
-def test_nothing_but_looks_changes_and_shapes_of_one_colour_stay_alike(task):
+def test_nothing_but_the_appearance_changes_and_shapes_of_one_colour_stay_alike(task):
     robot = get_robot(task.robot)
-    varied, scene = vary_appearance(robot, task.scene, np.random.default_rng(0))
+    varied, scene = randomise_appearance(robot, task.scene, np.random.default_rng(0))
     for old, new in zip(task.scene.bodies, scene.bodies, strict=True):
         shapes = [
             dataclasses.replace(s, rgba=o.rgba) for s, o in zip(new.shapes, old.shapes, strict=True)
@@ -52,20 +52,21 @@ def test_nothing_but_looks_changes_and_shapes_of_one_colour_stay_alike(task):
     assert dataclasses.replace(varied, cameras=robot.cameras) is not varied
 
 
-def test_a_seed_gives_the_same_looks_and_another_seed_others(task):
+def test_a_seed_gives_the_same_appearance_and_another_seed_another(task):
     robot = get_robot(task.robot)
     a, b, c = (
-        vary_appearance(robot, task.scene, np.random.default_rng(seed))[1] for seed in (1, 1, 2)
+        randomise_appearance(robot, task.scene, np.random.default_rng(seed))[1]
+        for seed in (1, 1, 2)
     )
     assert repr(a) == repr(b) != repr(c)
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_a_state_saved_in_plain_looks_is_restored_in_others_and_looks_otherwise(name, peg_task):
+def test_a_state_is_restored_in_a_scene_of_another_appearance(name, peg_task):
     robot = get_robot(peg_task.robot)
     plain = make_backend(name, robot, peg_task.scene, 48)
     varied = make_backend(
-        name, *vary_appearance(robot, peg_task.scene, np.random.default_rng(3)), 48
+        name, *randomise_appearance(robot, peg_task.scene, np.random.default_rng(3)), 48
     )
     plain.reset(peg_task.scene.initial_state(robot.home, 0.5))
     varied.restore(plain.save())

@@ -55,7 +55,7 @@ def test_a_state_has_every_body_where_the_scene_or_the_caller_puts_it():
     assert (state.q.shape, state.gripper) == ((6,), 0.5)
 
 
-def test_a_pose_of_a_body_that_the_scene_lacks_is_told_with_the_nearest_name():
+def test_a_pose_of_a_body_that_the_scene_lacks_is_reported_with_the_nearest_name():
     scene = SceneSpec((Body("lid", BOX),))
     with pytest.raises(UnknownName, match="unknown body 'lidd': did you mean 'lid'"):
         scene.initial_state(np.zeros(6), 0.0, {"lidd": np.eye(4)})

@@ -78,8 +78,8 @@ def test_the_cup_is_as_wide_and_deep_inside_as_its_card_says():
     assert floor.T_body_shape[2, 3] + floor.size[1] / 2 == pytest.approx(FLOOR)
 
 
-def _moved(stages, *p_world):
-    return [replace(stage, T_world_tool=pose(p_world) @ stage.T_world_tool) for stage in stages]
+def _moved(steps, *p_world):
+    return [replace(step, T_world_tool=pose(p_world) @ step.T_world_tool) for step in steps]
 
 
 def test_the_bottle_does_not_slip_and_nothing_else_is_touched(demonstrate):
@@ -110,17 +110,17 @@ def test_the_bottle_does_not_slip_and_nothing_else_is_touched(demonstrate):
     ("change", "text"),
     [
         pytest.param(
-            lambda stages: [replace(s, gripper=1.0) for s in stages[:3]],
+            lambda steps: [replace(s, gripper=1.0) for s in steps[:3]],
             "jaws only (2|3)[0-9] mm apart",
             id="never let go",
         ),
         pytest.param(
-            lambda stages: _moved(stages, 0, 0.055, CUP_DEPTH + 0.01),
+            lambda steps: _moved(steps, 0, 0.055, CUP_DEPTH + 0.01),
             "tilted|beside",
             id="let go over the rim",
         ),
         pytest.param(
-            lambda stages: _moved(stages, 0.12, 0, 0),
+            lambda steps: _moved(steps, 0.12, 0, 0),
             "1[12][0-9] mm beside",
             id="stood beside the cup",
         ),

@@ -53,14 +53,14 @@ def _opened_deg(demonstration):
     return np.rad2deg([TASK.scene.joint_position("door", row) for row in rows])
 
 
-def _shifted(stages, p_cabinet):
-    """The stages with the tool shifted [m], in the cabinet's axes."""
+def _shifted(steps, p_cabinet):
+    """The steps with the tool shifted [m], in the cabinet's axes."""
     shift = pose(PLACEMENT.T_middle_object[:3, :3] @ p_cabinet)
-    return [replace(stage, T_world_tool=shift @ stage.T_world_tool) for stage in stages]
+    return [replace(step, T_world_tool=shift @ step.T_world_tool) for step in steps]
 
 
 def _handle_pixels(rgb):
-    """How many pixels of pictures `(..., H, W, 3)` have the handle's yellow."""
+    """How many pixels of images `(..., H, W, 3)` have the handle's yellow."""
     return (rgb[..., 0].astype(int) - rgb[..., 2] > 80).sum((-2, -1))
 
 
@@ -82,9 +82,9 @@ def test_the_fingers_pull_gently_at_nothing_but_the_door_and_see_the_handle(demo
 
 
 def test_a_door_that_is_let_go_falls_shut(demonstrate):
-    def let_go(stages):
-        back = replace(_shifted(stages, [0.02, -0.02, 0])[-1], tolerance=0.01)
-        return [*stages, back, _shifted([back], [0, 0, 0.06])[0]]
+    def let_go(steps):
+        back = replace(_shifted(steps, [0.02, -0.02, 0])[-1], tolerance=0.01)
+        return [*steps, back, _shifted([back], [0, 0, 0.06])[0]]
 
     demonstration = demonstrate(let_go)
     assert demonstration.success.any()
@@ -93,20 +93,20 @@ def test_a_door_that_is_let_go_falls_shut(demonstrate):
 
 
 def test_pulling_over_the_handle_leaves_the_door_shut(demonstrate):
-    demonstration = demonstrate(lambda stages: _shifted(stages, [0, 0, 0.03]))
+    demonstration = demonstrate(lambda steps: _shifted(steps, [0, 0, 0.03]))
     assert not any(demonstration.touching)
     assert _opened_deg(demonstration).max() < 0.1
 
 
 def test_pulling_in_front_of_the_handle_leaves_the_door_shut(demonstrate):
     before = [-2 * BAR_RADIUS - BAR_GAP, 0, 0]
-    demonstration = demonstrate(lambda stages: _shifted(stages, before))
+    demonstration = demonstrate(lambda steps: _shifted(steps, before))
     assert _opened_deg(demonstration).max() < 0.1
 
 
 def test_pushing_against_the_panel_leaves_the_door_shut(demonstrate):
-    def push(stages):
-        beside = _shifted(stages[:2], [0, 0.1, 0])
+    def push(steps):
+        beside = _shifted(steps[:2], [0, 0.1, 0])
         return [*beside, replace(_shifted(beside[-1:], [0.016, 0, 0])[0], tolerance=0.004)]
 
     demonstration = demonstrate(push)
@@ -115,6 +115,6 @@ def test_pushing_against_the_panel_leaves_the_door_shut(demonstrate):
 
 
 def test_a_door_pulled_half_open_is_no_success(demonstrate):
-    demonstration = demonstrate(lambda stages: [*stages[:4], replace(stages[4], through=False)])
+    demonstration = demonstrate(lambda steps: [*steps[:4], replace(steps[4], through=False)])
     assert 20 < _opened_deg(demonstration)[-1] < 40
     assert not demonstration.success.any()

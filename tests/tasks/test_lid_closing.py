@@ -69,8 +69,8 @@ def test_spring_and_catch_are_as_strong_as_the_card_says():
     assert HINGE.effort(np.deg2rad(OPEN_DEG)) == pytest.approx(0.04, abs=0.005)
 
 
-def _moved(stages, *p_tool):
-    return [replace(stage, T_world_tool=stage.T_world_tool @ pose(p_tool)) for stage in stages]
+def _moved(steps, *p_tool):
+    return [replace(step, T_world_tool=step.T_world_tool @ pose(p_tool)) for step in steps]
 
 
 def _angles_deg(demonstration):
@@ -97,17 +97,17 @@ def test_the_lid_waits_open_and_stays_shut_and_nothing_else_is_touched(demonstra
 @pytest.mark.parametrize(
     ("change", "opens"),
     [
-        pytest.param(lambda stages: _moved(stages, 0.075, 0, 0), True, id="pressed beside"),
+        pytest.param(lambda steps: _moved(steps, 0.075, 0, 0), True, id="pressed beside"),
         pytest.param(
-            lambda stages: [
-                stages[0],
-                *_moved(stages[1:2], 0, 0, -0.018),
-                *_moved(stages[2:], 0, 0, -0.04),
+            lambda steps: [
+                steps[0],
+                *_moved(steps[1:2], 0, 0, -0.018),
+                *_moved(steps[2:], 0, 0, -0.04),
             ],
             True,
             id="pressed halfway",
         ),
-        pytest.param(lambda stages: stages[:2], False, id="not let go"),
+        pytest.param(lambda steps: steps[:2], False, id="not let go"),
     ],
 )
 def test_no_other_way_is_a_success(demonstrate, backend, change, opens):

@@ -51,14 +51,12 @@ def _opened_deg(demonstration):
     return np.rad2deg([TASK.scene.joint_position("lid", row) for row in rows])
 
 
-def _raised(stages, height):
-    return [
-        replace(stage, T_world_tool=pose([0, 0, height]) @ stage.T_world_tool) for stage in stages
-    ]
+def _raised(steps, height):
+    return [replace(step, T_world_tool=pose([0, 0, height]) @ step.T_world_tool) for step in steps]
 
 
 def _rim_pixels(rgb):
-    """How many pixels of pictures `(..., H, W, 3)` have the yellow of the notch's rim."""
+    """How many pixels of images `(..., H, W, 3)` have the yellow of the notch's rim."""
     return (rgb[..., 0].astype(int) - rgb[..., 2] > 80).sum((-2, -1))
 
 
@@ -82,12 +80,12 @@ def test_the_fingertips_lift_gently_touch_nothing_but_the_lid_and_see_the_notch(
     assert demonstration.steps.contact_force[-5:].max() == 0
 
 
-@pytest.mark.parametrize("legs", [5, 6])
-def test_a_lid_let_go_before_it_turns_over_falls_shut(demonstrate, legs):
-    def let_go(stages):
-        last = replace(stages[legs - 1], through=False, tolerance=0.005)
+@pytest.mark.parametrize("count", [5, 6])
+def test_a_lid_let_go_before_it_turns_over_falls_shut(demonstrate, count):
+    def let_go(steps):
+        last = replace(steps[count - 1], through=False, tolerance=0.005)
         away = replace(last, T_world_tool=last.T_world_tool @ pose([0, 0, -0.08]))
-        return [*stages[: legs - 1], last, away]
+        return [*steps[: count - 1], last, away]
 
     demonstration = demonstrate(let_go)
     assert 40 < _opened_deg(demonstration).max() < 80
@@ -96,18 +94,18 @@ def test_a_lid_let_go_before_it_turns_over_falls_shut(demonstrate, legs):
 
 
 def test_sweeping_over_the_lid_leaves_it_shut(demonstrate):
-    demonstration = demonstrate(lambda stages: _raised(stages, 0.07))
+    demonstration = demonstrate(lambda steps: _raised(steps, 0.07))
     assert not any(demonstration.touching)
     assert _opened_deg(demonstration).max() < 0.1
 
 
 def test_pressing_on_the_lid_leaves_it_shut(demonstrate, model):
-    def press(stages):
+    def press(steps):
         T_world_box = TASK.initial_state(model, PLACEMENT).Ts_world_body["box"]
-        T = stages[1].T_world_tool.copy()
+        T = steps[1].T_world_tool.copy()
         p_lowest = T[:3, :3] @ [0, -0.011, 0.018]
         T[:3, 3] = (T_world_box @ [0.06, 0, BOX_HEIGHT + LID_THICKNESS, 1])[:3] - p_lowest
-        on_lid = replace(stages[1], T_world_tool=T, tolerance=0.004)
+        on_lid = replace(steps[1], T_world_tool=T, tolerance=0.004)
         return [*_raised([on_lid], 0.05), *_raised([on_lid], -0.002)]
 
     demonstration = demonstrate(press)

@@ -55,7 +55,7 @@ def _object(task):
 
 
 def _seen_pixels(backend, names):
-    """How many of the wrist picture's pixels show one of some bodies, by depth."""
+    """How many of the wrist image's pixels show one of some bodies, by depth."""
     seen = backend.observe(("wrist",))
     view = seen.cameras["wrist"]
     size = len(view.depth)
@@ -121,7 +121,7 @@ def test_success_counts_as_achieved_when_it_lasted_until_the_end(task):
 
 
 def test_at_the_start_there_is_room_for_a_sphere_that_covers_every_placement(task, model, backend):
-    """Nothing touches but what is grasped, and all that the tool carries is clear."""
+    """Nothing touches but what is grasped, and all that the tool holds is clear."""
     needed = 0.11 if task.name == "peg_in_hole" else 0.20
     fingers = model.spec.gripper.finger_links
     first = task.initial_state(model, Placement())
@@ -134,13 +134,13 @@ def test_at_the_start_there_is_room_for_a_sphere_that_covers_every_placement(tas
             backend.command(state.q, state.commanded_gripper)
             backend.step()
         touching = [(contact.a, contact.b) for contact in backend.contacts()]
-        carried = task.scene.grasped(touching, fingers)
-        assert not task.scene.outer_contacts(touching, carried)
+        grasped = task.scene.grasped(touching, fingers)
+        assert not task.scene.outer_contacts(touching, grasped)
         seen = backend.observe()
         placed = collision.placed(
             seen.Ts_world_body,
             float(np.clip(seen.gripper, 0, 1)),
-            {name: inverse(seen.T_world_tool) @ seen.Ts_world_body[name] for name in carried},
+            {name: inverse(seen.T_world_tool) @ seen.Ts_world_body[name] for name in grasped},
         )
         nearest = placed.tool_clearances(seen.q)[0]
         assert nearest.distance > needed, nearest
@@ -171,12 +171,12 @@ def test_the_scripted_operator_succeeds_wherever_the_object_stands(task, model, 
     some = [task.sample_placement(np.random.default_rng(i)) for i in range(2)]
     turned = [task.sample_placement(np.random.default_rng(9), task.yaw_range_deg)]
     for i, placement in enumerate([*_corners(task), *some, *turned]):
-        stages = task.plan(task.initial_state(model, placement))
+        steps = task.plan(task.initial_state(model, placement))
         demonstration = record_demonstration(
             backend,
             task,
             model,
-            ScriptedOperator(stages, np.random.default_rng(i)),
+            ScriptedOperator(steps, np.random.default_rng(i)),
             placement,
             config=SessionConfig(cameras=(), keep_states=False),
         )

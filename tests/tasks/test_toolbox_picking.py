@@ -69,8 +69,8 @@ def test_a_failure_reason_says_what_is_missing(observation, text):
     assert TASK.failure_reason(observation) == text
 
 
-def _moved(stages, *p_tool):
-    return [replace(stage, T_world_tool=stage.T_world_tool @ pose(p_tool)) for stage in stages]
+def _moved(steps, *p_tool):
+    return [replace(step, T_world_tool=step.T_world_tool @ pose(p_tool)) for step in steps]
 
 
 def test_the_box_hangs_still_between_the_pads_and_nothing_else_is_touched(demonstrate):
@@ -99,17 +99,17 @@ def test_the_box_hangs_still_between_the_pads_and_nothing_else_is_touched(demons
     ("change", "text"),
     [
         pytest.param(
-            lambda stages: [replace(stage, gripper=0.0) for stage in stages],
+            lambda steps: [replace(step, gripper=0.0) for step in steps],
             "from between the fingers",
             id="fingers left open",
         ),
         pytest.param(
-            lambda stages: [*stages[:-1], *_moved(stages[2:3], 0, 0, -0.02)],
+            lambda steps: [*steps[:-1], *_moved(steps[2:3], 0, 0, -0.02)],
             "only (1|2)[0-9] mm above the table",
             id="lifted by 2 cm only",
         ),
         pytest.param(
-            lambda stages: _moved(stages, 0.09, 0, 0),
+            lambda steps: _moved(steps, 0.09, 0, 0),
             "from between the fingers",
             id="grasped beside the handle",
         ),

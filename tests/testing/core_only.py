@@ -11,7 +11,7 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "07_own_backend.py"
 class CoreOnly(sart.Backend):
     """The example of one's own backend with all but its core hidden."""
 
-    name, no_pictures = "core_only", "it has no cameras"
+    name, no_images = "core_only", "it has no cameras"
 
     def __init__(self, robot, scene, *options):
         super().__init__(robot, scene, *options)

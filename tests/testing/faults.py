@@ -15,17 +15,17 @@ from sart_toolkit.poses import Array
 from sart_toolkit.robots.spec import CameraSpec, ImageSize, RobotSpec
 from sart_toolkit.scenes.spec import Joint, SceneSpec, SceneState
 
-# --- pictures -----------------------------------------------------------------------------------
+# --- images -----------------------------------------------------------------------------------
 
 
 class _SpoiledCamera(PyBulletBackend):
-    """Takes pictures as if the cameras were others, and says that they are the right ones."""
+    """Takes images as if the cameras were others, and says that they are the right ones."""
 
     def spoilt(self, spec: CameraSpec) -> CameraSpec:
         return spec
 
-    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
-        view = super()._picture(self.spoilt(camera), width, height)
+    def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        view = super()._image(self.spoilt(camera), width, height)
         T = self._frame_pose(camera.frame) @ camera.T_frame_camera
         return dataclasses.replace(view, T_world_camera=T)
 
@@ -45,20 +45,20 @@ class WideFieldOfView(_SpoiledCamera):
         return dataclasses.replace(spec, fov_y_deg=1.1 * spec.fov_y_deg)
 
 
-class _SpoiledPicture(PyBulletBackend):
+class _SpoiledView(PyBulletBackend):
     def spoilt(self, view: CameraView, spec: CameraSpec) -> CameraView:
         raise NotImplementedError
 
-    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
-        return self.spoilt(super()._picture(camera, width, height), camera)
+    def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        return self.spoilt(super()._image(camera, width, height), camera)
 
 
-class DepthInMillimetres(_SpoiledPicture):
+class DepthInMillimetres(_SpoiledView):
     def spoilt(self, view: CameraView, spec: CameraSpec) -> CameraView:
         return dataclasses.replace(view, depth=view.depth * np.float32(1000))
 
 
-class DepthAlongTheRay(_SpoiledPicture):
+class DepthAlongTheRay(_SpoiledView):
     def spoilt(self, view: CameraView, spec: CameraSpec) -> CameraView:
         height, width = view.depth.shape
         rows, columns = np.mgrid[:height, :width]
@@ -67,18 +67,18 @@ class DepthAlongTheRay(_SpoiledPicture):
         return dataclasses.replace(view, depth=(view.depth * length).astype(np.float32))
 
 
-class FarthestDepthForNothing(_SpoiledPicture):
+class FarthestDepthForNothing(_SpoiledView):
     def spoilt(self, view: CameraView, spec: CameraSpec) -> CameraView:
         depth = np.where(view.depth == 0, np.float32(spec.far), view.depth)
         return dataclasses.replace(view, depth=depth)
 
 
-class DepthUpsideDown(_SpoiledPicture):
+class DepthUpsideDown(_SpoiledView):
     def spoilt(self, view: CameraView, spec: CameraSpec) -> CameraView:
         return dataclasses.replace(view, depth=np.ascontiguousarray(view.depth[::-1]))
 
 
-class BlueGreenRed(_SpoiledPicture):
+class BlueGreenRed(_SpoiledView):
     def spoilt(self, view: CameraView, spec: CameraSpec) -> CameraView:
         return dataclasses.replace(view, rgb=np.ascontiguousarray(view.rgb[:, :, ::-1]))
 
@@ -86,28 +86,28 @@ class BlueGreenRed(_SpoiledPicture):
 class CameraPoseOfItsFrame(PyBulletBackend):
     """`T_world_camera` leaves out where the camera is in its frame."""
 
-    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
-        view = super()._picture(camera, width, height)
+    def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        view = super()._image(camera, width, height)
         return dataclasses.replace(view, T_world_camera=self._frame_pose(camera.frame))
 
 
 class WristCameraStays(PyBulletBackend):
-    """The wrist camera's pictures are taken from where it is at home."""
+    """The wrist camera's images are taken from where it is at home."""
 
-    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+    def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
         T_world_camera = self._frame_pose(camera.frame) @ camera.T_frame_camera
         if camera.frame != "world":
             T = self._model.fk(self.robot.home, camera.frame) @ camera.T_frame_camera
             camera = dataclasses.replace(camera, frame="world", T_frame_camera=T)
-        view = super()._picture(camera, width, height)
+        view = super()._image(camera, width, height)
         return dataclasses.replace(view, T_world_camera=T_world_camera)
 
 
-class PicturesStretched(PyBulletBackend):
-    """A picture shows a square of the world, whatever its shape."""
+class ImagesStretched(PyBulletBackend):
+    """An image shows a square of the world, whatever its shape."""
 
-    def _picture(self, camera: CameraSpec, width: int, height: int) -> CameraView:
-        view = super()._picture(camera, height, height)
+    def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        view = super()._image(camera, height, height)
         columns = (np.arange(width) + 0.5) * height / width
         rgb, depth = view.rgb[:, columns.astype(int)], view.depth[:, columns.astype(int)]
         return dataclasses.replace(view, rgb=rgb, depth=depth)
@@ -117,7 +117,7 @@ class DrawsThePresent(PyBulletBackend):
     """Draws where everything is now, whatever state it is given."""
 
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
-        return self._picture(camera, width, height)
+        return self._image(camera, width, height)
 
 
 class DrawsItsOwnCamera(PyBulletBackend):
@@ -132,7 +132,7 @@ class DrawingResets(PyBulletBackend):
 
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
         self.reset(state)
-        return self._picture(camera, width, height)
+        return self._image(camera, width, height)
 
 
 # --- motion -------------------------------------------------------------------------------------
@@ -443,7 +443,7 @@ class _OnlyDrawsIn(Joint):
 
 
 class DetentsOnlyDrawIn(_OtherJoints):
-    """A catch pulls from as far as it is felt."""
+    """A catch pulls from its full width."""
 
     def spoilt(self, joint: Joint) -> Joint:
         return _OnlyDrawsIn(**{f.name: getattr(joint, f.name) for f in dataclasses.fields(joint)})
@@ -466,7 +466,7 @@ class BodiesFallInHoney(PyBulletBackend):
 
 
 class ResetKeepsSpeed(PyBulletBackend):
-    """Free bodies go on as fast as they were."""
+    """Free bodies keep moving as fast as they were."""
 
     _stepped = False
 
@@ -524,7 +524,7 @@ class RestoreForgetsSpeeds(PyBulletBackend):
 
 
 class RestoreForgetsTime(PyBulletBackend):
-    """Time goes on."""
+    """Time passes."""
 
     def restore(self, state: bytes) -> None:
         time = self._time
@@ -576,8 +576,8 @@ class ForgetsWhatItHolds(PyBulletBackend):
         return {name: T for name, T in super().body_poses().items() if name != "stick"}
 
 
-class SilentlyWithoutPictures(PyBulletBackend):
-    """Returns no pictures, and gives no reason."""
+class SilentlyWithoutImages(PyBulletBackend):
+    """Returns no images, and gives no reason."""
 
     def observe(
         self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
@@ -587,9 +587,9 @@ class SilentlyWithoutPictures(PyBulletBackend):
 
 
 class SilentThoughItHasAReason(PyBulletBackend):
-    """Declares that it takes no pictures, and leaves them out where they are asked for."""
+    """Declares that it takes no images, and leaves them out where they are asked for."""
 
-    no_pictures = "has no cameras"
+    no_images = "has no cameras"
 
     def observe(
         self, cameras: Sequence[str] = (), image_size: ImageSize | None = None

@@ -1,4 +1,4 @@
-"""What the suite tests is told on the command line; told wrongly, it says how."""
+"""What the suite tests is given on the command line; given wrongly, it says how."""
 
 from __future__ import annotations
 

@@ -73,10 +73,10 @@ def probed(peg_task, peg_model):
         yield points
 
 
-def place(points, gripper=0.0, carried=None, **Ts_world_body):
-    """Put bodies somewhere, those not told of far away."""
+def place(points, gripper=0.0, grasped=None, **Ts_world_body):
+    """Put bodies somewhere, those not given far away."""
     far = {b.name: pose([5.0 + i, 5, 5]) for i, b in enumerate(points.scene.bodies)}
-    points.place({**far, **Ts_world_body}, gripper, carried or {})
+    points.place({**far, **Ts_world_body}, gripper, grasped or {})
 
 
 # --- exact distances ----------------------------------------------------------------------------
@@ -308,7 +308,7 @@ def test_a_shape_that_does_not_collide_is_not_near(peg_model):
             points.pair(peg_model.spec.home, "forearm_link", "ghost")
 
 
-def test_pairs_that_may_touch_are_not_looked_at(peg_task, peg_model):
+def test_pairs_that_may_touch_are_ignored(peg_task, peg_model):
     home = peg_model.spec.home
     tip = peg_model.fk(home, "peg")
     Ts = {"table": pose([0, 0, -1]), "block": tip @ pose([0.03, 0, 0.02])}
@@ -386,7 +386,7 @@ def test_where_nothing_is_within_reach_no_pair_is_named(peg, peg_model):
 # --- what place does ----------------------------------------------------------------------------
 
 
-def test_a_carried_body_follows_the_tool_and_touches_only_what_stands(solids, peg_model, rng):
+def test_a_grasped_body_follows_the_tool_and_touches_only_what_stands(solids, peg_model, rng):
     T_tool_box = pose([0, 0, 0.1], [0.3, 0, 0])
     model = RobotModel(solids.robot)
     for _ in range(10):
@@ -394,13 +394,13 @@ def test_a_carried_body_follows_the_tool_and_touches_only_what_stands(solids, pe
         gap = rng.uniform(0.001, 0.05)
         T_box = model.fk(q) @ T_tool_box
         # Below the box's lower face.
-        place(solids, carried={"box": T_tool_box}, ball=T_box @ pose([0, 0, 0.02 + gap + BALL]))
+        place(solids, grasped={"box": T_tool_box}, ball=T_box @ pose([0, 0, 0.02 + gap + BALL]))
         assert solids.pair(q, "box", "ball") == pytest.approx(gap, abs=SHAPE_ACCURACY)
         a, b, distance = solids.nearest(q)
         assert (a, b) == ("box", "ball")
         assert distance == pytest.approx(gap, abs=SHAPE_ACCURACY)
-    # In the gripper's body it touches nothing while carried; standing there it does.
-    place(solids, carried={"box": pose([0, 0, -0.1])})
+    # In the gripper's body it touches nothing while grasped; standing there it does.
+    place(solids, grasped={"box": pose([0, 0, -0.1])})
     assert solids.pair(q, "box", "gripper_base_link_inertia") < 0
     assert not solids.collides(q)
     place(solids, box=model.fk(q) @ pose([0, 0, -0.1]))
@@ -409,13 +409,13 @@ def test_a_carried_body_follows_the_tool_and_touches_only_what_stands(solids, pe
     assert not solids.collides(q + [1, 0, 0, 0, 0, 0])
 
 
-def test_a_carried_body_may_hit_the_arm_that_carries_it(solids):
+def test_a_grasped_body_may_hit_the_arm_that_carries_it(solids):
     model = RobotModel(solids.robot)
     home = model.spec.home
     place(solids)
     assert not solids.collides(home)
     T_tool_forearm = inverse(model.fk(home)) @ model.fk(home, "forearm_link")
-    place(solids, carried={"cube": T_tool_forearm @ pose([-0.2, 0, 0])})
+    place(solids, grasped={"cube": T_tool_forearm @ pose([-0.2, 0, 0])})
     assert solids.nearest(home)[:2] == ("cube", "forearm_link")
     assert solids.collides(home)
 
@@ -518,7 +518,7 @@ def test_joints_that_are_no_configuration_are_refused(peg, q):
             ask(q[None])
 
 
-def test_bodies_and_links_that_are_not_there_are_told(peg):
+def test_bodies_and_links_that_are_missing_are_reported(peg):
     with pytest.raises(UnknownName, match="unknown body 'block': did you mean 'blok'"):
         peg.place({"table": np.eye(4), "blok": np.eye(4)}, 0.0)
     with pytest.raises(UnknownName, match="unknown body 'blok': did you mean 'block'"):

@@ -247,7 +247,7 @@ def test_without_a_scene_lines_are_put_anywhere(peg_model, rng):
         random_segment(peg_model, peg_model.spec.home, rng, SceneSpec(()))
 
 
-def test_a_robot_that_may_start_nowhere_is_told(peg_model, rng, monkeypatch):
+def test_a_robot_that_may_start_nowhere_is_reported(peg_model, rng, monkeypatch):
     monkeypatch.setattr(clutter, "_TRIES", 5)
     with pytest.raises(MotionRejected, match="no line: 5 drawn ones are out of reach or start"):
         random_segment(

@@ -16,23 +16,23 @@ HERE = Path(__file__).parent
 EXAMPLES = HERE.parents[1] / "docs" / "examples"
 
 
-def _told(outcome):
+def _summary(outcome):
     return "\n\n".join(f"{test}: {message}" for test, message in outcome.failed.items())
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
-    """Nothing is skipped; pictures may be where SART_NO_PICTURES says that nothing can draw."""
+    """Nothing is skipped; images may be where SART_NO_IMAGES says that nothing can draw."""
     try:
         made = make_backend(backend, get_robot(robot), SceneSpec(()), 8)
     except MissingExtra as error:
         pytest.skip(str(error))
     made.close()
     outcome = run_suite([backend], robot)[backend]
-    assert not outcome.failed, _told(outcome)
-    if os.environ.get("SART_NO_PICTURES"):
-        assert all("lacks pictures" in reason for reason in outcome.skipped.values())
+    assert not outcome.failed, _summary(outcome)
+    if os.environ.get("SART_NO_IMAGES"):
+        assert all("lacks images" in reason for reason in outcome.skipped.values())
     else:
         assert outcome.skipped == {}
 
@@ -48,7 +48,7 @@ def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
                 "SavesStates",
                 "KnowsBodies",
                 "SensesContacts",
-                "pictures: it has no cameras",
+                "images: it has no cameras",
             },
         ),
     ],
@@ -59,7 +59,7 @@ def test_a_backend_with_some_abilities_or_none_keeps_the_rest_of_the_contract(
     """The example of one's own backend, and the bare core of it."""
     name = str(name)
     outcome = run_suite([name], "ur5e_2f85")[name]
-    assert not outcome.failed, _told(outcome)
+    assert not outcome.failed, _summary(outcome)
     assert outcome.passed >= 20
     reasons = {reason.split("lacks ")[1] for reason in outcome.skipped.values()}
     assert reasons == lacking

@@ -1,4 +1,4 @@
-"""A screen without a viewer: pictures of it, its windows, and what happens without Xvfb."""
+"""A screen without a viewer: images of it, its windows, and what happens without Xvfb."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def without_program(monkeypatch, name):
 
 
 @pytest.mark.parametrize("name", ["Xvfb", "xdotool"])
-def test_without_its_programs_the_remedy_is_told(monkeypatch, name):
+def test_without_its_programs_the_remedy_is_reported(monkeypatch, name):
     without_program(monkeypatch, name)
     with pytest.raises(MissingExtra, match=f"{name} not found; type: bash tools/setup_debian.sh"):
         check_desktop()
 
 
 @pytest.mark.window
-def test_a_key_reaches_the_window_and_changes_the_picture(wait_until, tmp_path):
+def test_a_key_reaches_the_window_and_changes_the_image(wait_until, tmp_path):
     pytest.importorskip("pygame")
     check_desktop()
     with Desktop(640, 480) as screen:

@@ -31,9 +31,9 @@ FAULTS = {
     "RestoreForgetsTargets": "test_restore_returns_the_commands_in_force",
     "HistoryInTheBytes": "test_a_restored_state_is_saved_as_the_same_bytes",
     "NoBodiesAfterAll": "test_an_ability_that_a_backend_has_works",
-    "SilentlyWithoutPictures": "test_a_backend_takes_pictures_or_says_why_not",
+    "SilentlyWithoutImages": "test_a_backend_takes_images_or_says_why_not",
     "SaysItSentMore": "test_a_command_returns_what_was_sent",
-    "DrawsThePresent": "test_a_drawn_state_looks_like_the_state",
+    "DrawsThePresent": "test_a_drawn_state_appears_as_the_state_does",
     "DrawingResets": "test_drawing_changes_nothing",
     "RatesOfItsOwn": "test_rates_are_those_asked_for",
     "CloseOnlyOnce": "test_closing_twice_does_nothing",
@@ -66,15 +66,15 @@ MORE_FAULTS = {
     "JointsWithoutLimits": "test_jointed_bodies_stay_within_their_limits",
     "BodiesFallInHoney": "test_a_free_body_falls_as_gravity_says",
     "ResetKeepsSpeed": "test_a_reset_stops_free_bodies",
-    "RestoreForgetsSpeeds": "test_a_falling_body_goes_on_falling_after_a_restore",
+    "RestoreForgetsSpeeds": "test_a_falling_body_keeps_falling_after_a_restore",
     "RestoreForgetsTime": "test_restore_returns_the_time",
     "ContactsOutliveAReset": (
         "test_what_happens_to_free_bodies_after_a_reset_depends_on_the_state_alone"
     ),
     "AnyScene": "test_a_state_of_another_scene_is_refused_and_changes_nothing",
-    "SilentThoughItHasAReason": "test_a_backend_takes_pictures_or_says_why_not",
+    "SilentThoughItHasAReason": "test_a_backend_takes_images_or_says_why_not",
     "ForgetsWhatItHolds": "test_the_bodies_observed_are_those_that_a_backend_knows",
-    "PicturesStretched": "test_bodies_appear_as_the_field_of_view_has_them",
+    "ImagesStretched": "test_bodies_appear_as_the_field_of_view_has_them",
     "DrawsItsOwnCamera": "test_a_drawing_camera_need_not_be_one_of_the_scene_s",
 }
 

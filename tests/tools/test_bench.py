@@ -55,7 +55,7 @@ def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
     out, err = capsys.readouterr()
     figures = json.loads(out.splitlines()[-1])["figures"]
     assert figures["kept"] == 1 and figures["attempted"] >= 1
-    # Each try simulates two seconds.
+    # Each attempt simulates two seconds.
     tries_per_second = figures["attempted"] * figures["kept_trajectories_per_second"]
     assert figures["simulated_over_wall"] == pytest.approx(2 * tries_per_second)
     assert "turn 1/1" in err
@@ -70,7 +70,7 @@ def test_the_dataset_benchmark_measures_programs_of_their_own(capsys):
     assert {n: row["kept"] for n, row in figures["augment"].items()} == {"2": 1, "3": 2}
 
 
-def test_a_measured_program_that_fails_is_told():
+def test_a_measured_program_that_fails_is_reported():
     with pytest.raises(SartError, match="a measured program failed: ValueError: so"):
         bench._measured("raise ValueError('so')")
 

@@ -21,13 +21,13 @@ def test_a_demonstration_is_recorded_by_keys_alone_in_the_real_window(tmp_path, 
     pytest.importorskip("pygame")
     assert human_path.main([str(tmp_path), "--stages", "record"]) == 0
     assert "record " in capsys.readouterr().out
-    shown = load_demonstration(tmp_path / "demo.h5")
-    assert shown.success[-10:].all() and shown.device == "keyboard"
-    assert shown.operator == "machine hands"
-    assert shown.seconds >= shown.timestamps[-1] * 0.9
-    for phase in ("ready", "recording", "ended", "saved"):
-        with Image.open(tmp_path / "pictures" / f"record_{phase}.png") as picture:
-            assert picture.size == (1280, 800)
+    demo = load_demonstration(tmp_path / "demo.h5")
+    assert demo.success[-10:].all() and demo.device == "keyboard"
+    assert demo.operator == "scripted input"
+    assert demo.seconds >= demo.timestamps[-1] * 0.9
+    for state in ("ready", "recording", "ended", "saved"):
+        with Image.open(tmp_path / "images" / f"record_{state}.png") as image:
+            assert image.size == (1280, 800)
     rows = [json.loads(line) for line in (tmp_path / "status.jsonl").read_text().splitlines()]
     assert [rows[0]["state"], rows[-1]["state"]] == ["ready", "saved"]
 
@@ -49,7 +49,7 @@ def test_peg_in_hole_is_annotated_by_few_keys(tmp_path, peg_demonstration):
         assert {sphere["source"] for sphere in row["spheres"]} == {source}
         assert row["seconds"] > 0 and len(row["spheres"]) > 1
         load_annotation(tmp_path / f"{name}.json").check_matches(peg_demonstration)
-        assert (tmp_path / "pictures" / f"annotate_{name}.png").stat().st_size > 10_000
+        assert (tmp_path / "images" / f"annotate_{name}.png").stat().st_size > 10_000
 
 
 def test_a_stage_that_lacks_what_an_earlier_one_leaves_is_an_error(tmp_path, capsys):

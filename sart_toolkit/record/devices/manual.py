@@ -34,7 +34,7 @@ SPEEDS = (Speed("slow", 0.02, 8.0), Speed("normal", 0.06, 25.0), Speed("fast", 0
 
 
 class Control(enum.Enum):
-    """What a person tells the recording, beside steering."""
+    """What a person asks of the recording, beside steering."""
 
     NEXT = "next"
     REDO = "redo"
@@ -46,7 +46,7 @@ class Views:
     """Which way is which for a hand that moves right, forward and up by what is on the screen.
 
     `R_world_hand (3, 3)`: right and away in the scene view, level, and vertically up.
-    `R_tool_hand (3, 3)`: right and upwards in the wrist picture, and back out along the tool.
+    `R_tool_hand (3, 3)`: right and upwards in the wrist image, and back out along the tool.
     """
 
     R_world_hand: Array
@@ -89,8 +89,8 @@ def _axes(right: Array, up: Array) -> Array:
 class ManualDevice(Device):
     """A device in a person's hand.
 
-    A subclass tells by `poll` how the hand pushes and turns; speed, frame, smoothness and gripper
-    are seen to here, as are the keys that work whatever one steers with.
+    A subclass returns from `poll` how the hand pushes and turns; speed, frame, smoothness and
+    gripper are handled here, as are the keys that work with every device.
 
     Attributes:
         speed: one of `SPEEDS`.
@@ -142,7 +142,7 @@ class ManualDevice(Device):
         return
 
     def rest(self) -> None:
-        """The hand at rest and the gripper as at the start, for another try."""
+        """The hand at rest and the gripper as at the start, for another attempt."""
         self.gripper = self._start_gripper
         self.halt()
         self.let_go()
@@ -152,7 +152,7 @@ class ManualDevice(Device):
         self._velocity = np.zeros(6)
 
     def let_go(self) -> None:
-        """Forget what is pressed: the window no longer hears when keys are released."""
+        """Forget what is pressed: the window is no longer notified when keys are released."""
         return
 
     def key(self, name: str, down: bool) -> bool:
@@ -180,7 +180,7 @@ class ManualDevice(Device):
         self.frame = "tool" if self.frame == "world" else "world"
 
     def switch_gripper(self) -> None:
-        """Open the gripper if it is told to hold, close it if it is told to open."""
+        """Open the gripper if it is commanded to hold, close it if it is commanded to open."""
         self.gripper = 0.0 if self.gripper > 0.5 else 1.0
 
     def change_speed(self, by: int) -> None:

@@ -98,7 +98,7 @@ class SpaceMouse(ManualDevice):
         if kind == _BUTTONS:
             self._press(int.from_bytes(content, "little"))
             return
-        # Older models tell translation and rotation in turn, newer ones both at once.
+        # Older models report translation and rotation in turn, newer ones both at once.
         wanted = {_TRANSLATION: 6 if len(content) >= 12 else 3, _ROTATION: 3}.get(kind, 0)
         if wanted and len(content) >= 2 * wanted:
             values = struct.unpack(f"<{wanted}h", content[: 2 * wanted])
@@ -115,7 +115,7 @@ class SpaceMouse(ManualDevice):
 
 
 def is_spacemouse(info: dict[str, Any]) -> bool:
-    """Whether what hidapi tells of a device is a SpaceMouse's."""
+    """Whether what hidapi reports of a device is a SpaceMouse's."""
     known = {_LOGITECH: _LOGITECH_PRODUCTS, _3DCONNEXION: _3DCONNEXION_PRODUCTS}
     if info["vendor_id"] not in known:
         return False

@@ -36,7 +36,7 @@ def test_an_unknown_device_is_refused_with_the_nearest(peg_setup):
 
 
 class Puppet(ManualDevice):
-    """Pushes and turns as told."""
+    """Pushes and turns as set."""
 
     name = "puppet"
     axes = np.zeros(6)
@@ -61,7 +61,7 @@ def settled(device, observation, periods=60):
 
 
 def test_world_directions_are_those_of_the_scene_view(puppet, peg_task, make_session):
-    """Right moves right in the picture, forward away from the camera, up moves up."""
+    """Right moves right in the image, forward away from the camera, up moves up."""
     now = make_session().observation
     R_world_tool = now.T_world_tool[:3, :3]
     R_world_camera = peg_task.scene.cameras[0].T_frame_camera[:3, :3]
@@ -88,7 +88,7 @@ def test_tool_directions_are_those_of_the_wrist_view(puppet, make_session):
     )
     assert right[0] == pytest.approx(0.06)
     assert forward[1] < -0.03
-    assert up[2] < -0.03, "out of the picture, back along the tool"
+    assert up[2] < -0.03, "out of the image, back along the tool"
 
 
 def test_without_a_camera_in_the_scene_the_person_stands_behind_the_robot(peg_model, peg_task):
@@ -205,7 +205,7 @@ def test_an_unknown_frame_is_refused(peg_setup):
         Puppet(dataclasses.replace(peg_setup, frame="base"))
 
 
-def test_controls_are_told_once(puppet):
+def test_controls_are_reported_once(puppet):
     puppet._controls.append(Control.NEXT)
     assert puppet.controls() == [Control.NEXT] and puppet.controls() == []
 

@@ -202,7 +202,7 @@ def test_an_emulated_gamepad_drives_a_whole_recording_with_its_own_buttons(
     assert saved[0].device == "gamepad" and saved[0].success[-10:].all()
 
 
-def test_unplugging_pauses_and_plugging_in_goes_on(virtual, peg_setup, make_session, tick_until):
+def test_unplugging_pauses_and_plugging_in_resumes(virtual, peg_setup, make_session, tick_until):
     session, device = make_session(), Gamepad(peg_setup)
     device.connect()
     desk = RecordingDesk(session, device, lambda _: None)

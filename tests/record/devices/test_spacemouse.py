@@ -197,7 +197,7 @@ def test_an_emulated_spacemouse_drives_a_whole_recording(
     assert saved[0].device == "spacemouse" and saved[0].success[-10:].all()
 
 
-def test_unplugging_pauses_keeps_the_data_and_says_so_and_plugging_in_goes_on(
+def test_unplugging_pauses_keeps_the_data_and_says_so_and_plugging_in_resumes(
     bus, spacemouse, make_session, tick_until, ended
 ):
     saved = []

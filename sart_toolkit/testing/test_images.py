@@ -1,4 +1,4 @@
-"""Pictures: where things appear, how far they are, in which colours."""
+"""Images: where things appear, how far they are, in which colours."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _middle(mask: Array) -> Array | None:
 
 
 def _projected(bench: Bench, camera: str, body: str) -> Array:
-    """Where a body's origin should be `(u, v)` [pixels] from the middle of the picture."""
+    """Where a body's origin should be `(u, v)` [pixels] from the middle of the image."""
     spec, state = bench.backend.cameras[camera], bench.state(bench.q)
     frame = np.eye(4) if spec.frame == "world" else bench.model.fk(bench.see().q, spec.frame)
     p = (
@@ -69,16 +69,16 @@ def test_bodies_appear_where_the_camera_s_pose_has_them(view: Bench, camera: str
     OpenGL's cameras look along -z with y up; others take the pose's inverse.
     """
     camera = _wrist(view) if camera == "wrist" else camera
-    picture = _take(view, camera)
-    ball, bead = _from_middle(picture, "green"), _from_middle(picture, "magenta")
-    assert ball is not None and bead is not None, "ball and bead are not in the picture"
+    image = _take(view, camera)
+    ball, bead = _from_middle(image, "green"), _from_middle(image, "magenta")
+    assert ball is not None and bead is not None, "ball and bead are not in the image"
     assert np.linalg.norm(ball) < 1.5
     assert _same_direction(bead, _projected(view, camera, "bead"), 8.0)
 
 
 @pytest.mark.parametrize("size", [(64, 64), (129, 129), (160, 120), (112, 128)])
 def test_bodies_appear_as_the_field_of_view_has_them(view: Bench, size: tuple[int, int]) -> None:
-    """Intrinsics: a square of dots is as large as it should be, its middle at the picture's.
+    """Intrinsics: a square of dots is as large as it should be, its middle at the image's.
 
     `fov_y_deg` is the whole vertical angle, pixels are square, and (0, 0) is the centre of the
     first pixel.
@@ -86,7 +86,7 @@ def test_bodies_appear_as_the_field_of_view_has_them(view: Bench, size: tuple[in
     green = _coloured(_take(view, "room", size), "green")
     u, v = (n // 2 for n in size)
     upper_left, lower_right = _middle(green[:v, :u]), _middle(green[-v:, -u:])
-    assert upper_left is not None and lower_right is not None, "the dots are not in the picture"
+    assert upper_left is not None and lower_right is not None, "the dots are not in the image"
     K = view.backend.cameras["room"].intrinsics(*size)
     offset = K[0, 0] * DOT_OFFSET / (ROOM_HALF_WIDTH - DOT_THICKNESS)
     lower_right = lower_right + np.subtract(size, (u, v))
@@ -102,7 +102,7 @@ def test_depth_is_in_metres(view: Bench) -> None:
 
 
 def test_depth_is_along_the_camera_s_axis(view: Bench) -> None:
-    """Not along the ray: a wall across the view is equally far in the picture's corners."""
+    """Not along the ray: a wall across the view is equally far in the image's corners."""
     depth = _take(view, "room").depth
     corners = depth[[0, 0, -1, -1], [0, -1, 0, -1]]
     np.testing.assert_allclose(corners / depth[_SIZE // 2, _SIZE // 2], 1.0, rtol=0, atol=0.01)
@@ -114,13 +114,13 @@ def test_depth_is_zero_where_nothing_was_hit(view: Bench) -> None:
 
 
 def test_depth_and_colour_show_the_same(view: Bench) -> None:
-    """Where the bead is in the picture, it is nearer than all around it."""
-    picture = _take(view, "left", 192)
-    bead = _coloured(picture, "magenta")
+    """Where the bead is in the image, it is nearer than all around it."""
+    image = _take(view, "left", 192)
+    bead = _coloured(image, "magenta")
     view.relies_on(bead.sum() > 20, _EXTRINSICS)
     rows, columns = np.nonzero(bead)
     window = np.s_[rows.min() - 2 : rows.max() + 3, columns.min() - 2 : columns.max() + 3]
-    depth = np.where(picture.depth > 0, picture.depth, np.inf)[window]
+    depth = np.where(image.depth > 0, image.depth, np.inf)[window]
     near = depth < 1.1 * depth.min()
     assert (near & bead[window]).sum() > 0.75 * (near | bead[window]).sum()
 
@@ -131,23 +131,23 @@ def test_colours_are_red_green_and_blue_in_order(view: Bench) -> None:
     assert r > 40 and g < 0.5 * r and b < 0.5 * r
 
 
-def test_pictures_have_the_size_asked_for(view: Bench) -> None:
+def test_images_have_the_size_asked_for(view: Bench) -> None:
     """Or else the backend's own."""
     for size in (1, 33, (16, 9), None):
-        picture = view.see((_wrist(view),), size).cameras[_wrist(view)]
+        image = view.see((_wrist(view),), size).cameras[_wrist(view)]
         width, height = check_image_size(size or view.backend.image_size)
-        assert picture.rgb.shape == (height, width, 3)
-        assert picture.depth.shape == (height, width)
+        assert image.rgb.shape == (height, width, 3)
+        assert image.depth.shape == (height, width)
 
 
-def test_pictures_have_bytes_for_colours_and_float32_for_depth(view: Bench) -> None:
+def test_images_have_bytes_for_colours_and_float32_for_depth(view: Bench) -> None:
     """As they are recorded."""
-    picture = _take(view, "left", 8)
-    assert picture.rgb.dtype == np.uint8
-    assert picture.depth.dtype == np.float32
+    image = _take(view, "left", 8)
+    assert image.rgb.dtype == np.uint8
+    assert image.depth.dtype == np.float32
 
 
-def test_only_pictures_asked_for_are_taken(view: Bench) -> None:
+def test_only_images_asked_for_are_taken(view: Bench) -> None:
     """By name, each once."""
     assert not view.see().cameras
     names = {"room", _wrist(view)}
@@ -159,16 +159,16 @@ def test_a_camera_s_reported_pose_is_that_of_its_frame(view: Bench) -> None:
     for offset in (0.0, 0.1):
         view.reset(view.ready + offset)
         seen = view.see((_wrist(view), "left"), 4)
-        for name, picture in seen.cameras.items():
+        for name, image in seen.cameras.items():
             spec = view.backend.cameras[name]
             T = np.eye(4) if spec.frame == "world" else view.model.fk(seen.q, spec.frame)
             np.testing.assert_allclose(
-                picture.T_world_camera, T @ spec.T_frame_camera, rtol=0, atol=1e-4
+                image.T_world_camera, T @ spec.T_frame_camera, rtol=0, atol=1e-4
             )
 
 
 def test_the_wrist_camera_moves_with_the_tool(view: Bench) -> None:
-    """What was in the middle of its picture is where the moved tool has it."""
+    """What was in the middle of its image is where the moved tool has it."""
     ball = _from_middle(_take(view, _wrist(view)), "green")
     view.relies_on(ball is not None and np.linalg.norm(ball) < 1.5, _EXTRINSICS)
     for sideways in (-0.03, 0.03):
@@ -176,12 +176,12 @@ def test_the_wrist_camera_moves_with_the_tool(view: Bench) -> None:
         view.reset(view.model.ik(T, view.ready))
         ball = _from_middle(_take(view, _wrist(view)), "green")
         expected = _projected(view, _wrist(view), "ball")
-        assert ball is not None, "the ball is no longer in the picture"
-        assert np.linalg.norm(ball) > 3, "the picture hasn't changed"
+        assert ball is not None, "the ball is no longer in the image"
+        assert np.linalg.norm(ball) > 3, "the image hasn't changed"
         assert _same_direction(ball, expected, 10.0)
 
 
-def test_pictures_show_bodies_where_they_are_now(view: Bench) -> None:
+def test_images_show_bodies_where_they_are_now(view: Bench) -> None:
     """A body that a reset has put elsewhere is drawn there."""
     ball = _from_middle(_take(view, "left"), "green")
     view.relies_on(ball is not None and np.linalg.norm(ball) < 1.5, _EXTRINSICS)
@@ -204,8 +204,8 @@ def _moved_ball(bench: Bench) -> SceneState:
     return bench.state(bench.ready + 0.1, Ts_world_body={"ball": place})
 
 
-def test_a_drawn_state_looks_like_the_state(view: Bench) -> None:
-    """As a picture of the same state after a reset does."""
+def test_a_drawn_state_appears_as_the_state_does(view: Bench) -> None:
+    """As an image of the same state after a reset does."""
     view.needs(Draws, Resets)
     state = _moved_ball(view)
     for name in ("left", _wrist(view)):
@@ -250,7 +250,7 @@ def test_drawing_changes_nothing(view: Bench) -> None:
 
 
 @pytest.mark.parametrize("size", [0, -1])
-def test_a_picture_without_pixels_is_refused(view: Bench, size: int) -> None:
+def test_an_image_without_pixels_is_refused(view: Bench, size: int) -> None:
     """When it is made and when it is asked for."""
     with pytest.raises(InvalidInput, match="image_size"):
         get_backend(view.backend_name)(view.backend.robot, view.scene, size)
@@ -259,6 +259,6 @@ def test_a_picture_without_pixels_is_refused(view: Bench, size: int) -> None:
 
 
 def test_an_unknown_camera_is_refused(bench: Bench) -> None:
-    """By its name, with the ones that there are, also where no picture could be taken."""
+    """By its name, with the ones that there are, also where no image could be taken."""
     with pytest.raises(UnknownName, match="'sidewise'.*side"):
         bench.see(("sidewise",))

@@ -1,6 +1,6 @@
-"""Draws `docs/pictures/planned.png`: straight and planned segments where a wall stands in a ball.
+"""Draws `docs/images/planned.png`: straight and planned segments where a wall stands in a ball.
 
-`python tools/planned_picture.py [--out PNG]` prints one JSON object. The same poses are drawn by
+`python tools/planned_image.py [--out PNG]` prints one JSON object. The same poses are drawn by
 both strategies, in peg-in-hole's scene with a wall; each way that is drawn in full is certified.
 """
 
@@ -98,13 +98,13 @@ class _Draw(NamedTuple):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The exit code of drawing the picture."""
+    """The exit code of drawing the image."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("docs/pictures/planned.png"), help="PNG")
+    parser.add_argument("--out", type=Path, default=Path("docs/images/planned.png"), help="PNG")
     parser.add_argument("--draws", type=int, default=_DRAWS, help="sampled poses")
     options = parser.parse_args(arguments)
     try:
-        figures = _draw_picture(options.out, options.draws)
+        figures = _draw_image(options.out, options.draws)
     except SartError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _draw_picture(out: Path, draws: int) -> dict[str, Any]:
+def _draw_image(out: Path, draws: int) -> dict[str, Any]:
     task = WalledPegInHole()
     robot = get_robot(task.robot)
     backend = make_backend("pybullet", robot, task.scene)
@@ -120,12 +120,12 @@ def _draw_picture(out: Path, draws: int) -> dict[str, Any]:
     operator = ScriptedOperator(
         task.plan(task.initial_state(model, Placement())), np.random.default_rng(0)
     )
-    shown = record_demonstration(
+    demonstration = record_demonstration(
         backend, task, model, operator, seed=0, config=SessionConfig(cameras=())
     )
-    T_key = shown.steps.measured_Ts_world_tool[0]
-    annotation = Annotation((PrecisionSphere(0, T_key, _RADIUS),), shown.content_hash())
-    world = ExactWorld(shown, robot, task.scene)
+    T_key = demonstration.steps.measured_Ts_world_tool[0]
+    annotation = Annotation((PrecisionSphere(0, T_key, _RADIUS),), demonstration.content_hash())
+    world = ExactWorld(demonstration, robot, task.scene)
     planners = {
         name: SegmentPlanner(
             world,
@@ -138,13 +138,13 @@ def _draw_picture(out: Path, draws: int) -> dict[str, Any]:
         name: [_outcome(planner, k) for k in range(draws)] for name, planner in planners.items()
     }
     t_star = planners["sart"].proposal(0, 0)[0].t_star
-    backend.restore(shown.states[t_star])
+    backend.restore(demonstration.states[t_star])
     view = backend.observe(("stage",), _SIZE * _SUPERSAMPLED).cameras["stage"]
     backend.close()
     rgb = np.asarray(Image.fromarray(view.rgb).resize((_SIZE, _SIZE), Image.Resampling.LANCZOS))
     depth = np.asarray(view.depth[::_SUPERSAMPLED, ::_SUPERSAMPLED], float)
     out.parent.mkdir(parents=True, exist_ok=True)
-    _compose(rgb, depth, shown, t_star, outcomes).savefig(out, dpi=100)
+    _compose(rgb, depth, demonstration, t_star, outcomes).savefig(out, dpi=100)
     Image.open(out).convert("P", palette=Image.Palette.ADAPTIVE, colors=256).save(
         out, optimize=True
     )
@@ -165,7 +165,7 @@ def _draw_picture(out: Path, draws: int) -> dict[str, Any]:
             name: importlib.metadata.version(name)
             for name in ("sart_toolkit", "ompl", "coal", "pin", "pybullet")
         },
-        "picture": str(out),
+        "image": str(out),
     }
 
 
@@ -233,13 +233,13 @@ def _draw_way(axes: Any, draw: _Draw, depth: Array) -> None:
 def _compose(
     rgb: Array,
     depth: Array,
-    shown: Demonstration,
+    demonstration: Demonstration,
     t_star: int,
     outcomes: dict[str, list[_Draw]],
 ) -> Figure:
     figure = Figure(figsize=(2 * _SIZE / 100 + 0.3, _SIZE / 100 + 1.75), facecolor="white")
     FigureCanvasAgg(figure)
-    Ts = shown.steps.measured_Ts_world_tool
+    Ts = demonstration.steps.measured_Ts_world_tool
     p_key, p_star = Ts[0, :3, 3], Ts[t_star, :3, 3]
     draws = len(outcomes["sart"])
     width, height = figure.get_size_inches()

@@ -1,4 +1,4 @@
-"""Draws the strips of `docs/tasks.md`: `python tools/task_pictures.py [TASK ...]`.
+"""Draws the strips of `docs/tasks.md`: `python tools/task_images.py [TASK ...]`.
 
 For each task the scripted operator's demonstration, seen by the wrist camera and once from outside,
 one row a backend.
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code of drawing the named tasks' strips, or all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tasks", nargs="*", help=f"of {', '.join(TASKS)}; all if left out")
-    parser.add_argument("--out", type=Path, default=Path("docs/pictures/tasks"), help="folder")
+    parser.add_argument("--out", type=Path, default=Path("docs/images/tasks"), help="folder")
     parser.add_argument("--seed", type=int, default=0, help="of the operator's hand")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -48,20 +48,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _strip(name: str, seed: int) -> Image.Image:
-    """Rows of pictures, a backend each: moments of the demonstration, then its end from outside."""
+    """Rows of images, a backend each: moments of the demonstration, then its end from outside."""
     width = (_MOMENTS + 1) * (_SIZE + _GAP) - _GAP
     page = Image.new("RGB", (width, len(BACKENDS) * (_SIZE + _LABEL)), "white")
     draw = ImageDraw.Draw(page)
     font = ImageFont.load_default(13)
     for row, backend in enumerate(BACKENDS):
-        shown = _demonstration(name, backend, seed)
+        demonstration = _demonstration(name, backend, seed)
         top = row * (_SIZE + _LABEL)
-        moments = np.linspace(0, len(shown) - 1, _MOMENTS).round().astype(int)
+        moments = np.linspace(0, len(demonstration) - 1, _MOMENTS).round().astype(int)
         for column, t in enumerate([*moments, moments[-1]]):
             camera = "wrist" if column < _MOMENTS else "overview"
             left = column * (_SIZE + _GAP)
-            page.paste(Image.fromarray(shown.steps.cameras[camera].rgb[t]), (left, top + _LABEL))
-            text = f"{backend}, {shown.timestamps[t]:.1f} s"
+            page.paste(
+                Image.fromarray(demonstration.steps.cameras[camera].rgb[t]), (left, top + _LABEL)
+            )
+            text = f"{backend}, {demonstration.timestamps[t]:.1f} s"
             text = text if camera == "wrist" else "from outside, at the end"
             draw.text((left + 2, top + 3), text, fill="black", font=font)
     return page
@@ -75,9 +77,9 @@ def _demonstration(name: str, backend_name: str, seed: int) -> Demonstration:
         task.plan(task.initial_state(model, Placement())), np.random.default_rng(seed)
     )
     config = SessionConfig(cameras=("wrist", "overview"), keep_states=False)
-    shown = record_demonstration(backend, task, model, operator, seed=seed, config=config)
+    demonstration = record_demonstration(backend, task, model, operator, seed=seed, config=config)
     backend.close()
-    return shown
+    return demonstration
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Pictures by SAPIEN's rasteriser, and whether it can draw on this machine."""
+"""Images by SAPIEN's rasteriser, and whether it can draw on this machine."""
 
 from __future__ import annotations
 
@@ -164,18 +164,18 @@ for component in (
     scene.add_entity(entity)
 scene.update_render()
 component.take_picture()
-assert component.get_picture("Color").shape == (4, 4, 4), "its picture has another shape"
+assert component.get_picture("Color").shape == (4, 4, 4), "its image has another shape"
 """
 REMEDY = (
     "install Mesa 24.3 or newer (Debian: sudo bash tools/setup_debian.sh sapien) or the GPU's "
-    "driver, or use another backend for pictures"
+    "driver, or use another backend for images"
 )
 
 
-def why_no_pictures() -> str:
+def why_no_images() -> str:
     """Why SAPIEN can't draw on this machine; empty where it can.
 
-    A process of its own draws a tiny picture, since a broken driver may end it. The answer holds
+    A process of its own draws a tiny image, since a broken driver may end it. The answer holds
     for all processes with the same drivers and settings, for an hour where it can draw.
     """
     drivers = [
@@ -187,11 +187,11 @@ def why_no_pictures() -> str:
     settings = sorted(item for item in os.environ.items() if item[0].startswith(names))
     version = importlib.metadata.version("sapien")
     key = repr((version, sys.prefix, drivers, settings, _PROBE, _SHADERS))
-    return _why_no_pictures(hashlib.sha256(key.encode()).hexdigest()[:16])
+    return _why_no_images(hashlib.sha256(key.encode()).hexdigest()[:16])
 
 
 @functools.cache
-def _why_no_pictures(key: str) -> str:
+def _why_no_images(key: str) -> str:
     path = cache_dir() / f"sapien-{key}.json"
     with suppress(OSError, ValueError, KeyError, TypeError):
         known = json.loads(path.read_text())
@@ -243,7 +243,7 @@ def _probe() -> str:
             timeout=_PROBE_SECONDS,
         )
     except subprocess.TimeoutExpired:
-        return f"no picture within {_PROBE_SECONDS} s"
+        return f"no image within {_PROBE_SECONDS} s"
     if done.returncode == 0:
         return ""
     said = done.stderr.strip().splitlines() or [f"its process ended with {done.returncode}"]
@@ -268,7 +268,7 @@ def sapien_axis(axis: Array) -> Array:
 ALONG_Z = sapien_axis(np.array([0.0, 0.0, 1.0]))
 
 
-class Pictures:
+class Renderer:
     """A scene and robot as SAPIEN draws them: meshes, light and shadow, but nothing that moves.
 
     Nothing here depends on the physics, so bodies are drawn wherever they are said to be.
@@ -325,7 +325,7 @@ class Pictures:
         joints: Mapping[int, Array],
         bodies: Mapping[str, Array],
     ) -> dict[str, CameraView]:
-        """The pictures of cameras, by name.
+        """The images of cameras, by name.
 
         Args:
             cameras: each camera and the pose `(4, 4)` of its frame in the world.
@@ -353,7 +353,7 @@ class Pictures:
         if key not in self._cameras:
             component = sapien.render.RenderCameraComponent(width, height, _shader_folder())
             K = camera.intrinsics(width, height)
-            # SAPIEN counts pixels from the picture's corner.
+            # SAPIEN counts pixels from the image's corner.
             component.set_perspective_parameters(
                 camera.near, camera.far, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, 0.0
             )
