@@ -73,6 +73,7 @@ from .backends.states import (
 from .backends.states import (
     unpack_state as unpack_state,
 )
+from .collision import make_world as make_world
 from .collision.certificate import Certificate as Certificate
 from .collision.certificate import certify as certify
 from .collision.cloud import CloudConfig as CloudConfig
@@ -80,7 +81,6 @@ from .collision.cloud_world import CloudWorld as CloudWorld
 from .collision.exact import ExactWorld as ExactWorld
 from .collision.model import CollisionModel as CollisionModel
 from .collision.world import CollisionWorld as CollisionWorld
-from .collision.world import make_world as make_world
 from .data.assets import asset as asset
 from .data.dataset import Dataset as Dataset
 from .data.dataset import load_dataset as load_dataset
@@ -250,7 +250,7 @@ from .scenes.appearance import (
     AppearanceConfig as AppearanceConfig,
 )
 from .scenes.appearance import (
-    vary_appearance as vary_appearance,
+    randomise_appearance as randomise_appearance,
 )
 from .scenes.spec import (
     Body as Body,

@@ -310,8 +310,8 @@ def world_of(
     robot: RobotLike | None = None,
 ) -> CollisionWorld:
     """Where the obstacles of a demonstration are, from its scene or from its images alone."""
+    from sart_toolkit.collision import make_world
     from sart_toolkit.collision.cloud import CloudConfig
-    from sart_toolkit.collision.world import make_world
 
     spec, scene = robot_of(demonstration, robot), task_of(demonstration, task).scene
     cloud = CloudConfig(unknown=unknown)

@@ -9,7 +9,7 @@ import pinocchio as pin
 import trimesh
 from numpy.typing import NDArray
 
-from sart_toolkit.collision.model import primitive
+from sart_toolkit.collision.parts import primitive
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape, check_gripper

@@ -11,8 +11,8 @@ import numpy as np
 
 from sart_toolkit.augment import STRATEGIES, get_strategy
 from sart_toolkit.augment.strategies import Strategy
+from sart_toolkit.collision import SOURCES, Source
 from sart_toolkit.collision.phases import IN_GRASP_SLIP
-from sart_toolkit.collision.world import SOURCES, Source
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive

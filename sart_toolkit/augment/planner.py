@@ -7,9 +7,10 @@ import numpy as np
 from sart_toolkit.augment import get_strategy
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.strategies import Proposal
+from sart_toolkit.collision import make_world
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
-from sart_toolkit.collision.world import CollisionWorld, make_world
+from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import MotionRejected, Unreachable
 from sart_toolkit.motion.line import straight_line

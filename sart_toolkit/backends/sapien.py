@@ -34,7 +34,7 @@ from sart_toolkit.backends.sapien_renderer import (
     why_no_images,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
-from sart_toolkit.collision.model import primitive
+from sart_toolkit.collision.parts import primitive
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import InvalidInput, MissingCapability, SartError
 from sart_toolkit.poses import Array

@@ -23,7 +23,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit.backends.interface import CameraView
-from sart_toolkit.collision.model import primitive
+from sart_toolkit.collision.parts import primitive
 from sart_toolkit.errors import CannotWrite, MissingCapability, MissingExtra
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.spec import CameraSpec, Shape

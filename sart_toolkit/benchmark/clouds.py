@@ -16,7 +16,7 @@ from sart_toolkit.collision.cloud import fuse_cloud, surface_errors
 from sart_toolkit.collision.cloud_world import CloudWorld
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.hull import Hull
-from sart_toolkit.collision.model import ConvexPart
+from sart_toolkit.collision.parts import ConvexPart
 from sart_toolkit.data.records import library_versions
 from sart_toolkit.poses import Array
 from sart_toolkit.record.scripted import ScriptedOperator

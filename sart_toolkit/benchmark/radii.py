@@ -17,7 +17,8 @@ from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
 from sart_toolkit.benchmark.cells import Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision.exact import ExactWorld
-from sart_toolkit.collision.model import PlacedModel, coal_transform, convex_distance
+from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.collision.parts import coal_transform, convex_distance
 from sart_toolkit.data.records import (
     PrecisionSphere,
     library_versions,

@@ -20,7 +20,7 @@ from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, check_counts, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
-from sart_toolkit.collision.world import Source
+from sart_toolkit.collision import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     Annotation,

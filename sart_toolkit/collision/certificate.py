@@ -8,14 +8,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from sart_toolkit.collision.model import (
-    Enclosures,
-    Index,
-    PlacedModel,
-    cross,
-    gap_text,
-    norms,
-)
+from sart_toolkit.collision.model import Enclosures, Index, PlacedModel, cross, gap_text, norms
 from sart_toolkit.errors import InvalidInput, MotionRejected
 from sart_toolkit.poses import Array, check_positive
 

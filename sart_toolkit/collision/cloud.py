@@ -19,7 +19,7 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
 from sart_toolkit.collision.hull import Hull
-from sart_toolkit.collision.model import robot_parts
+from sart_toolkit.collision.parts import robot_parts
 from sart_toolkit.data.records import CameraRecord, Demonstration, Image, summary
 from sart_toolkit.errors import InvalidInput, Mismatch, unknown_name
 from sart_toolkit.poses import (

@@ -14,8 +14,9 @@ from sart_toolkit.collision.cloud import (
     fuse_cloud,
     grasped_object,
 )
-from sart_toolkit.collision.model import CollisionModel, ConvexPart, PlacedModel
+from sart_toolkit.collision.model import CollisionModel, PlacedModel
 from sart_toolkit.collision.obstacles import CloudObstacles, hull_part
+from sart_toolkit.collision.parts import ConvexPart
 from sart_toolkit.collision.phases import IN_GRASP_SLIP
 from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import Demonstration

@@ -5,22 +5,24 @@ from __future__ import annotations
 import functools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from sart_toolkit.collision.obstacles import CloudObstacles
+from sart_toolkit.collision.parts import (
+    ConvexPart,
+    coal_geometry,
+    coal_transform,
+    robot_parts,
+)
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import Array, check_pose, frozen, inverse
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec, Shape
+from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec
-
-if TYPE_CHECKING:
-    # It measures distances of the parts defined here.
-    from sart_toolkit.collision.obstacles import CloudObstacles
 
 CLOUD = "cloud"
 Index = NDArray[np.intp]
@@ -53,40 +55,6 @@ class PairDistance:
     def pair(self) -> tuple[str, str]:
         """The two names."""
         return self.a, self.b
-
-
-@dataclass(frozen=True, eq=False)
-class ConvexPart:
-    """A convex part of a body: its geometry and its pose `T_joint_part (4, 4)` on joint `joint`.
-
-    `joint` counts the arm's joints from 1; what no joint moves is on joint 0, the world. The hull
-    of `points (n, 3)`, in the joint's frame, encloses the part.
-    """
-
-    body: str
-    joint: int
-    geometry: coal.CollisionGeometry
-    T_joint_part: Array
-    points: Array
-
-    @functools.cached_property
-    def sphere(self) -> tuple[Array, float]:
-        """Centre `(3,)` and radius [m] of a sphere about the part, in the joint's frame."""
-        centre = (self.points.min(0) + self.points.max(0)) / 2
-        return centre, float(np.linalg.norm(self.points - centre, axis=1).max())
-
-    @functools.cached_property
-    def box(self) -> tuple[Array, Array, Array]:
-        """Axes `(3, 3)`, centre `(3,)` and half edges `(3,)` of a box about it, joint's frame."""
-        R = self.T_joint_part[:3, :3]
-        local = self.points @ R
-        low, high = local.min(0), local.max(0)
-        return R, R @ (low + high) / 2, (high - low) / 2
-
-    @functools.cached_property
-    def reach(self) -> float:
-        """How far [m] any point of the part is from the joint's origin."""
-        return float(np.linalg.norm(self.points, axis=1).max())
 
 
 class CollisionModel:
@@ -578,86 +546,8 @@ def _axis_distances(model: PlacedModel) -> Array:
     return distances
 
 
-def robot_parts(model: RobotModel) -> list[ConvexPart]:
-    """The convex parts of a robot's links and of what it holds, as its URDF has them.
-
-    Raises:
-        InvalidInput: a part is neither a mesh nor a box, sphere or cylinder.
-    """
-    pinocchio_model = model.pinocchio_model
-    loaded = pin.buildGeomFromUrdf(
-        pinocchio_model,
-        str(model.urdf),
-        pin.GeometryType.COLLISION,
-        package_dirs=str(model.urdf.parent),
-    )
-    parts = []
-    for item in loaded.geometryObjects:
-        geometry = item.geometry
-        if isinstance(geometry, coal.BVHModelBase):
-            geometry.buildConvexHull(True, "Qt")
-            geometry = geometry.convex
-        frame = pinocchio_model.frames[item.parentFrame]
-        T = np.array(item.placement.homogeneous)
-        points = _points(geometry) @ T[:3, :3].T + T[:3, 3]
-        parts.append(ConvexPart(frame.name, int(item.parentJoint), geometry, T, points))
-    return parts
-
-
-def _points(geometry: coal.CollisionGeometry) -> Array:
-    """Points `(n, 3)` whose convex hull encloses a convex geometry."""
-    if isinstance(geometry, coal.ConvexBase):
-        return np.array(geometry.points()).reshape(-1, 3)
-    return primitive(geometry).corners()
-
-
-def primitive(geometry: coal.CollisionGeometry) -> Shape:
-    """A box, sphere or cylinder of a URDF as a shape at its body's origin.
-
-    Raises:
-        InvalidInput: it is none of these.
-    """
-    if isinstance(geometry, coal.Box):
-        x, y, z = (2 * float(half) for half in geometry.halfSide)
-        return Shape("box", (x, y, z))
-    if isinstance(geometry, coal.Sphere):
-        return Shape("sphere", (float(geometry.radius),))
-    if isinstance(geometry, coal.Cylinder):
-        return Shape("cylinder", (float(geometry.radius), 2 * float(geometry.halfLength)))
-    raise InvalidInput(
-        f"geometry {type(geometry).__name__} is neither a mesh nor a box, sphere or cylinder; use "
-        "these in the URDF"
-    )
-
-
 def gap_text(distance: float, margin: float) -> str:
     """How two bodies at a distance [m] that is less than the margin [m] stand, for a message."""
     if distance < 0:
         return f"they overlap by {-distance * 1e3:.1f} mm"
     return f"{distance * 1e3:.1f} mm apart, {margin * 1e3:.1f} mm are asked for"
-
-
-def coal_geometry(shape: Shape) -> coal.CollisionGeometry:
-    """A shape as coal takes it, at its own origin."""
-    if shape.kind == "box":
-        return coal.Box(*shape.size)
-    if shape.kind == "sphere":
-        return coal.Sphere(*shape.size)
-    return coal.Cylinder(*shape.size)
-
-
-def coal_transform(T: Array) -> coal.Transform3s:
-    """A pose `(4, 4)` as coal takes it."""
-    return coal.Transform3s(T[:3, :3], T[:3, 3])
-
-
-def convex_distance(
-    a: coal.CollisionGeometry,
-    T_a: coal.Transform3s,
-    b: coal.CollisionGeometry,
-    T_b: coal.Transform3s,
-) -> float:
-    """The distance [m] between two convex geometries; negative where they overlap."""
-    # A result that is not new keeps the smallest distance it has seen.
-    result = coal.DistanceResult()
-    return float(coal.distance(a, T_a, b, T_b, coal.DistanceRequest(), result))

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from sart_toolkit.collision.cloud import SceneCloud
 from sart_toolkit.collision.hull import Hull
-from sart_toolkit.collision.model import ConvexPart, coal_transform
+from sart_toolkit.collision.parts import ConvexPart, coal_transform
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, check_array
 

@@ -27,7 +27,7 @@ from sart_toolkit.backends.interface import (
     SensesForce,
     require,
 )
-from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
+from sart_toolkit.collision.parts import coal_transform, convex_distance, robot_parts
 from sart_toolkit.errors import MissingCapability, MissingExtra
 from sart_toolkit.poses import Array, interpolate, inverse, pose
 from sart_toolkit.robots import get_robot

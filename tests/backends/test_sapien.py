@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sart_toolkit.backends import make_backend
-from sart_toolkit.collision.model import primitive
+from sart_toolkit.collision.parts import primitive
 from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import CannotWrite, InvalidInput, MissingCapability, SartError
 from sart_toolkit.poses import distance, interpolate, pose

@@ -19,8 +19,8 @@ from sart_toolkit.collision.cloud import (
     grasped_object,
     surface_errors,
 )
-from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
 from sart_toolkit.collision.obstacles import CloudObstacles, hull_part
+from sart_toolkit.collision.parts import coal_transform, convex_distance, robot_parts
 from sart_toolkit.data.records import CameraRecord
 from sart_toolkit.errors import InvalidInput, Mismatch, UnknownName
 from sart_toolkit.poses import inverse, pose

@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial import ConvexHull
 
-from sart_toolkit.collision.model import CollisionModel, robot_parts
+from sart_toolkit.collision.model import CollisionModel
+from sart_toolkit.collision.parts import robot_parts
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import pose
 from sart_toolkit.robots import ROBOTS, get_robot

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sart_toolkit.collision import SOURCES, make_world
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.cloud import CloudConfig
 from sart_toolkit.collision.cloud_world import CloudWorld
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CLOUD
-from sart_toolkit.collision.world import SOURCES, make_world
 from sart_toolkit.errors import Mismatch, UnknownName
 from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.robots import get_robot

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from sart_toolkit.collision.model import coal_transform, convex_distance, robot_parts
+from sart_toolkit.collision.parts import coal_transform, convex_distance, robot_parts
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import exp_rotation, inverse, pose
 from sart_toolkit.robots import get_robot
