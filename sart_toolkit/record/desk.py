@@ -193,7 +193,7 @@ class RecordingDesk:
         resumes = "→ saves it" if session.state is SessionState.ENDED else "→ resumes"
         self._ask(
             Control.DISCARD,
-            f"Esc again throws {session.seconds:.0f} s of recording away; {resumes}.",
+            f"Esc again discards {session.seconds:.0f} s of recording; {resumes}.",
         )
 
     def _ask(self, control: Control, question: str) -> None:
@@ -205,7 +205,7 @@ class RecordingDesk:
         try:
             self._save(demonstration)
         except SartError as error:
-            self._said = Notice(f"Not saved: {error}. → tries again; nothing is lost.", "bad")
+            self._said = Notice(f"Not saved: {error}. → saves again; nothing is lost.", "bad")
             return
         self.demonstration = demonstration
         session.mark_saved()

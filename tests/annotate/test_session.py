@@ -469,7 +469,7 @@ def test_a_file_that_was_changed_meanwhile_is_one_undo_away(session, open_sessio
 
 
 def test_one_process_at_a_time_works_on_an_annotation(session, tmp_path):
-    with pytest.raises(CannotWrite, match="another process is at work on it"):
+    with pytest.raises(CannotWrite, match="another process is using it"):
         Journal(tmp_path / "a.json.journal")
 
 

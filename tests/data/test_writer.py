@@ -176,9 +176,9 @@ def test_a_second_process_is_refused_while_the_first_is_at_work(carry_out, sourc
         found = subprocess.run(
             [sys.executable, "-c", _OTHER, manifest], capture_output=True, text=True
         )
-        assert "CannotWrite" in found.stderr and "another process is at work on it" in found.stderr
+        assert "CannotWrite" in found.stderr and "another process is using it" in found.stderr
         for overwrite in (True, False):
-            with pytest.raises(CannotWrite, match="another process is at work on it; end that one"):
+            with pytest.raises(CannotWrite, match="another process is using it; end that one"):
                 carry_out(path, overwrite=overwrite)
     assert carry_out(path) is not None
 

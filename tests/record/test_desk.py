@@ -118,7 +118,7 @@ def test_much_is_thrown_away_only_when_asked_twice(desk, saved, end_first):
     if end_first:
         desk.press(NEXT)
     desk.press(DISCARD)
-    assert not desk.done and "Esc again throws 4 s of recording away" in desk.notice.text
+    assert not desk.done and "Esc again discards 4 s of recording" in desk.notice.text
     assert desk.session.state is (SessionState.ENDED if end_first else SessionState.PAUSED)
     for _ in range(5):
         desk.tick()
@@ -149,7 +149,7 @@ def test_a_save_that_fails_loses_nothing_and_can_be_repeated(
     reached_goal(desk, keyboard, tick_until, ended)
     desk.press(NEXT)
     assert desk.session.state is SessionState.ENDED and desk.demonstration is None
-    assert "No space left" in desk.notice.text and "→ tries again" in desk.notice.text
+    assert "No space left" in desk.notice.text and "→ saves again" in desk.notice.text
     full[0] = False
     desk.press(NEXT)
     assert saved == [desk.demonstration]

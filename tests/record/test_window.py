@@ -150,7 +150,7 @@ def test_closing_the_window_asks_before_much_is_lost(pygame, window):
     for _ in range(120):
         window._desk.tick()
     window._take(Closed())
-    assert not window._desk.done and "Esc again throws" in window._desk.notice.text
+    assert not window._desk.done and "Esc again discards" in window._desk.notice.text
     window._take(Closed())
     assert window._desk.done
 
