@@ -400,7 +400,7 @@ def test_a_library_that_does_not_load_leads_to_the_doctor_who_needs_none(
 ) -> None:
     for name in ("sart_toolkit.cli.info", "pinocchio"):
         monkeypatch.setitem(sys.modules, name, None)
-    assert "`sart doctor` tells what is missing" in error(capsys, "info", "x")
+    assert "`sart doctor` says what is missing" in error(capsys, "info", "x")
 
     broken = Finding("kinematics", False, "libgomp.so.1 is missing", "install it", required=True)
     monkeypatch.setattr("sart_toolkit.doctor.diagnose", lambda full: [broken])
