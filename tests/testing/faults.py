@@ -12,6 +12,7 @@ from sart_toolkit.backends.interface import CameraView, CommandSent, Contact, Ob
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.backends.states import pack_state, unpack_state
 from sart_toolkit.poses import Array
+from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.spec import CameraSpec, ImageSize, RobotSpec
 from sart_toolkit.scenes.spec import Joint, SceneSpec, SceneState
 
@@ -287,7 +288,9 @@ class _OtherGripper(PyBulletBackend):
     changes: ClassVar[dict[str, float]] = {}
 
     def __init__(self, robot: RobotSpec, scene: SceneSpec, *options: Any) -> None:
-        changed = {name: getattr(robot.gripper, name) * by for name, by in self.changes.items()}
+        # What draws is made from the changed robot, and must not be changed twice.
+        proper = get_robot(robot.name).gripper
+        changed = {name: getattr(proper, name) * by for name, by in self.changes.items()}
         gripper = dataclasses.replace(robot.gripper, **changed)
         super().__init__(dataclasses.replace(robot, gripper=gripper), scene, *options)
 
