@@ -637,7 +637,7 @@ ACTIONS: Mapping[str, Action] = {
     "start": Action(("Home",), "first waypoint", lambda s: s._select(0)),
     "end": Action(("End",), "last waypoint", lambda s: s._select(s.last)),
     "following": Action(("N",), "next sphere", lambda s: s._to_sphere(1)),
-    "previous": Action(("P",), "sphere before", lambda s: s._to_sphere(-1)),
+    "previous": Action(("P",), "previous sphere", lambda s: s._to_sphere(-1)),
     "converge": Action(("C",), "convergence waypoint t*: next sphere", _Session._to_convergence),
     "add": Action(("Enter", "Space"), "add a sphere", _Session._add),
     "remove": Action(("Backspace", "Delete"), "remove it", _Session._remove),

@@ -121,7 +121,7 @@ def test_n_and_p_lead_from_sphere_to_sphere(session):
     press(session, "P")
     assert session.selected == waypoints(session)[0]
     press(session, "P")
-    assert session.refused and "no sphere before" in session.message
+    assert session.refused and "no previous sphere" in session.message
     press(session, "End", "N")
     assert session.refused and session.selected == session.last
 
