@@ -377,7 +377,7 @@ class AnnotationSession:
     def _to_sphere(self, way: int) -> str:
         ahead = [s.waypoint for s in self.spheres if way * (s.waypoint - self.selected) > 0]
         if not ahead:
-            raise InvalidInput(f"no sphere {'after' if way > 0 else 'before'} this one")
+            raise InvalidInput(f"no {'next' if way > 0 else 'previous'} sphere")
         return self._select(min(ahead, key=lambda t: abs(t - self.selected)))
 
     def _to_convergence(self) -> str:
