@@ -62,6 +62,9 @@ from .backends.interface import (
     SensesForce as SensesForce,
 )
 from .backends.interface import (
+    Simulator as Simulator,
+)
+from .backends.interface import (
     require as require,
 )
 from .backends.states import (

@@ -253,6 +253,10 @@ class Draws(abc.ABC):
         """
 
 
+class Simulator(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, Draws):
+    """A backend with all abilities, as simulators have them."""
+
+
 A = TypeVar("A")
 
 

@@ -15,16 +15,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit.backends.interface import (
-    Backend,
     CameraView,
     CommandSent,
     Contact,
-    Draws,
-    KnowsBodies,
     Observation,
-    Resets,
-    SavesStates,
-    SensesContacts,
+    Simulator,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
@@ -70,7 +65,7 @@ _URDF_FLAGS = p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_IMPLICIT_CYLINDER
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-class PyBulletBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, Draws):
+class PyBulletBackend(Simulator):
     """A robot in its scene in PyBullet, without a window.
 
     Between two commands the joint targets move linearly with each physics step, so that the motion

@@ -13,16 +13,11 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit.backends.interface import (
-    Backend,
     CameraView,
     CommandSent,
     Contact,
-    Draws,
-    KnowsBodies,
     Observation,
-    Resets,
-    SavesStates,
-    SensesContacts,
+    Simulator,
 )
 from sart_toolkit.backends.sapien_renderer import (
     ALONG_Z,
@@ -107,7 +102,7 @@ class _Moment:
         return _Moment(np.array(plain["q"]), np.array(plain["dq"]), *bodies)
 
 
-class SapienBackend(Backend, Resets, SavesStates, SensesContacts, KnowsBodies, Draws):
+class SapienBackend(Simulator):
     """A robot in its scene in SAPIEN (PhysX 5 on the CPU), without a window.
 
     Between two commands the joint targets move linearly with each physics step, so that the motion
