@@ -18,6 +18,7 @@ _UNITS = {
     "suggest": "waypoint",
     "augment": "trajectory",
     "validate": "episode",
+    "read": "trajectory",
     "train": "step",
     "evaluate": "rollout",
     "operator": "episode",

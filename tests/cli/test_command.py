@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
+import sart_toolkit
 from sart_toolkit.cli import console, main
 from sart_toolkit.cli.arguments import Record
 from sart_toolkit.cli.console import ProgressDisplay
@@ -174,3 +177,25 @@ def test_on_a_terminal_progress_is_a_bar_for_each_stage(capsys, monkeypatch):
         progress("augment", 1, 2, "0 rejected")
     err = capsys.readouterr().err
     assert "suggest" in err and "4/4" in err and "augment" in err and "0 rejected" in err
+
+
+def _announced_stages() -> list[str]:
+    """Every stage that a source of the package names to its ``progress`` callback."""
+    sources = Path(sart_toolkit.__file__).parent.rglob("*.py")
+    return sorted(
+        {s for p in sources for s in re.findall(r'\bprogress\(\s*"(\w+)"', p.read_text())}
+    )
+
+
+def test_the_stages_are_found_in_the_sources() -> None:
+    assert {"record", "read", "train", "evaluate"} <= set(_announced_stages())
+
+
+@pytest.mark.parametrize("stage", _announced_stages())
+def test_each_announced_stage_shows_a_bar_on_a_terminal(
+    stage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with ProgressDisplay() as progress:
+        progress(stage, 1.0, 2.0)
+    assert stage in capsys.readouterr().err
