@@ -805,7 +805,7 @@ def _drive(backend: Backend, task: Task, seed: int) -> tuple[float, float]:
         desired = apply_motion(
             controller.commanded_T_world_tool, command.velocity / backend.rates.control_hz
         )
-        q = controller.move(desired, seen.T_world_tool, 1)[0]
+        (q,) = controller.move(desired, seen.T_world_tool, 1)
         started = time.perf_counter()
         backend.command(q, command.gripper)
         backend.step()

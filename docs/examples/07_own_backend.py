@@ -42,7 +42,8 @@ class Kinematic(sart.Backend, sart.Resets, sart.SavesStates, sart.KnowsBodies, s
         return sart.Observation(q, dq, float(gripper), self.model.fk(q), time, views, Ts)
 
     def command(self, q, gripper):
-        self.now["target"] = [self.model.check_limits(q).tolist(), sart.check_gripper(gripper)]
+        q = np.atleast_2d(self.model.check_limits(q))[-1]
+        self.now["target"] = [q.tolist(), sart.check_gripper(gripper)]
         return sart.CommandSent(q, gripper)
 
     def step(self):

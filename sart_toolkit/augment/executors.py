@@ -182,30 +182,43 @@ class RestoreExecutor(SegmentExecutor):
         gripper = float(steps.commanded_gripper[t_star])
         world = planner.world
         grasped = world.phases[t_star].grasped
-        controller = ToolController(world.kinematics)
+        controller = ToolController(world.kinematics, rates=rates)
         require(backend, SavesStates, _FROM_STATES).restore(demonstration.states[t_star])
-        controller.reset(
-            steps.commanded_joint_positions[t_star], steps.commanded_Ts_world_tool[t_star]
-        )
         cameras = recorded_cameras(demonstration, self._config)
         recorder = StepRecorder(backend, world.kinematics, cameras)
         start = recorded = backend.observe()
         measured = [start.q[None]]
-        times = motion.times(rates.control_hz)
-        for i, (time, q) in enumerate(zip(times, motion.joints(times), strict=True), 1):
-            # As a policy will be at its own rate, held to what was measured a recorded step ago.
-            controller.follow(q, motion.T_world_tool(time), recorded.T_world_tool)
-            sent = backend.command(q, gripper)
-            if not np.array_equal(sent.q, q) or sent.gripper != gripper:
+        controller.reset(
+            steps.commanded_joint_positions[t_star],
+            steps.commanded_Ts_world_tool[t_star],
+            moving=(start.q, start.dq),
+        )
+
+        def send(targets: Array) -> None:
+            sent = backend.command(targets, gripper)
+            if not np.array_equal(sent.q, targets[-1]) or sent.gripper != gripper:
                 raise MotionRejected("command cut short: the robot can't go so fast")
             backend.step()
             if isinstance(backend, SensesContacts):
                 check_untouched(backend.scene, backend.contacts(), grasped)
+
+        # What was on its way to the commanded pose comes to rest there.
+        while not controller.settled:
+            send(controller.hold())
+            recorded = backend.observe()
+            measured.append(joint_rows(recorded))
+        times = motion.times(rates.control_hz)
+        targets = motion.joints(motion.times(rates.physics_hz))
+        targets = targets.reshape(len(times), rates.physics_per_control, -1)
+        for i, (time, rows) in enumerate(zip(times, targets, strict=True), 1):
+            # As a policy will be at its own rate, held to what was measured a recorded step ago.
+            controller.follow(rows, motion.T_world_tool(time), recorded.T_world_tool)
+            send(rows)
             if i % rates.control_per_record:
                 seen = backend.observe()
             else:
                 seen = recorded = recorder.add(controller, gripper, 0.0)
-            measured.append(seen.joint_path if len(seen.joint_path) else seen.q[None])
+            measured.append(joint_rows(seen))
         check_undisturbed(backend.scene, grasped, start, recorded, self._config.slip_tolerance)
         return recorder, np.concatenate(measured)
 
@@ -298,6 +311,11 @@ def check_undisturbed(
         if far > most:
             what = "slipped in the grasp" if body.name in grasped else "was moved"
             raise MotionRejected(f"{body.name} {what}: by {far * 1e3:.1f} mm")
+
+
+def joint_rows(seen: Observation) -> Array:
+    """Where the joints were during the last control period `(m, n)`, as often as was measured."""
+    return seen.joint_path if len(seen.joint_path) else seen.q[None]
 
 
 def _micrometres_up(length: float) -> float:

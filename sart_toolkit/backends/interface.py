@@ -63,7 +63,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class CommandSent:
-    """The joint targets `q (n,)` [rad] and the gripper target in [0, 1] that were really sent."""
+    """The last joint targets `q (n,)` [rad] and the gripper target in [0, 1] really sent."""
 
     q: Array
     gripper: float
@@ -147,9 +147,19 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def command(self, q: Array, gripper: float) -> CommandSent:
-        """Set joint targets `(n,)` [rad] and gripper target in [0, 1], reached over the next step.
+        """Set the joint targets and the gripper target of the next step.
 
-        Where the robot can't go so far in one step, less may be sent; what is returned is what was.
+        The toolkit sends targets for each physics step, smooth and within the robot's limits of
+        velocity, acceleration and jerk (`JointInterpolator`), so that they can be passed on as they
+        are. Where the robot can't go so far in one step, less may be sent.
+
+        Args:
+            q: targets [rad] `(m, n)` at m even steps up to the end of the control period, or one
+                `(n,)` for its end; in between they are joined linearly.
+            gripper: target in [0, 1], 0 open, 1 closed, reached linearly.
+
+        Returns:
+            The last targets `(n,)` that were really sent.
 
         Raises:
             InvalidInput: wrong shape, not finite, outside limits.

@@ -22,6 +22,7 @@ from sart_toolkit.backends.interface import (
     Simulator,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
+from sart_toolkit.backends.targets import PeriodTargets
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.poses import Array, inverse
@@ -30,7 +31,6 @@ from sart_toolkit.robots.spec import (
     CameraSpec,
     ImageSize,
     RobotSpec,
-    check_gripper,
     check_image_size,
 )
 from sart_toolkit.robots.urdf import add_joint, rigid_link
@@ -68,10 +68,9 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 class PyBulletBackend(Simulator):
     """A robot in its scene in PyBullet, without a window.
 
-    Between two commands the joint targets move linearly with each physics step, so that the motion
-    is as smooth as an arm's own interpolator makes it. The gripper's linkage follows its driver
-    through gear constraints. Arm and tool may collide with each other; neighbouring links may not.
-    The friction between two bodies is the product of their coefficients.
+    The gripper's linkage follows its driver through gear constraints. Arm and tool may collide with
+    each other; neighbouring links may not. The friction between two bodies is the product of their
+    coefficients.
     """
 
     name = "pybullet"
@@ -116,8 +115,7 @@ class PyBulletBackend(Simulator):
         self._joint_path: list[list[float]] = []
         self._time = 0.0
         self._scene_digest = scene_digest(self._model, scene)
-        n = len(robot.arm_joints)
-        self._target = self._last_target = np.zeros(n + 1)
+        self._targets = PeriodTargets(self._model, rates.physics_per_control)
         # Another world with the same in it, where states are drawn.
         self._stage: PyBulletBackend | None = None
         # The bytes restored last, until something changes: Bullet renumbers contacts each time.
@@ -205,7 +203,7 @@ class PyBulletBackend(Simulator):
         self.scene.check_state(state)
         self._forget_contacts()
         self._place(state)
-        self._target = self._last_target = np.append(q, state.commanded_gripper)
+        self._targets.rest_at(q, state.commanded_gripper)
         self._time = 0.0
         self._touched = {}
         # A restore from the file that this state saves to also drops what the solver remembers of
@@ -306,9 +304,8 @@ class PyBulletBackend(Simulator):
         return CameraView(np.ascontiguousarray(rgb), depth.astype(np.float32), T_world_camera)
 
     def command(self, q: Array, gripper: float) -> CommandSent:
-        sent = CommandSent(self._model.check_limits(q), check_gripper(gripper))
+        sent = self._targets.command(q, gripper)
         self._restored = None
-        self._target = np.append(sent.q, sent.gripper)
         return sent
 
     def step(self) -> None:
@@ -319,9 +316,7 @@ class PyBulletBackend(Simulator):
         self._touched = {}
         self._joint_path = []
         self._restored = None
-        steps = self.rates.physics_per_control
-        for i in range(1, steps + 1):
-            target = self._last_target + (i / steps) * (self._target - self._last_target)
+        for target in self._targets.rows:
             # Position gain 1 closes the whole error within one physics step. A velocity target
             # beside it would put the arm one physics step ahead of its targets.
             c.setJointMotorControlArray(
@@ -339,7 +334,7 @@ class PyBulletBackend(Simulator):
             c.stepSimulation()
             self._joint_path.append([s[0] for s in c.getJointStates(robot, arm)])
             self._collect_contacts()
-        self._last_target = self._target
+        self._targets.advance()
         self._time += 1.0 / self.rates.control_hz
 
     def _collect_contacts(self) -> None:
@@ -376,8 +371,7 @@ class PyBulletBackend(Simulator):
             "robot": self.robot.name,
             "scene": self._scene_digest,
             "bodies": sorted(self._bodies),
-            "target": self._target.tolist(),
-            "last_target": self._last_target.tolist(),
+            **self._targets.to_json(),
             "time": self._time,
         }
         return pack_state(self.name, head, world)
@@ -397,8 +391,7 @@ class PyBulletBackend(Simulator):
             raise BrokenFile(f"saved state: PyBullet refuses it ({error})") from error
         finally:
             os.unlink(path)
-        self._target = np.array(head["target"])
-        self._last_target = np.array(head["last_target"])
+        self._targets.take(head)
         self._time = head["time"]
         self._touched = {}
         self._joint_path = []

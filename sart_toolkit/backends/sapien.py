@@ -29,6 +29,7 @@ from sart_toolkit.backends.sapien_renderer import (
     why_no_images,
 )
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
+from sart_toolkit.backends.targets import PeriodTargets
 from sart_toolkit.collision.parts import primitive
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import InvalidInput, MissingCapability, SartError
@@ -39,7 +40,6 @@ from sart_toolkit.robots.spec import (
     ImageSize,
     RobotSpec,
     Shape,
-    check_gripper,
     check_image_size,
     mass_properties,
 )
@@ -105,11 +105,10 @@ class _Moment:
 class SapienBackend(Simulator):
     """A robot in its scene in SAPIEN (PhysX 5 on the CPU), without a window.
 
-    Between two commands the joint targets move linearly with each physics step, so that the motion
-    is as smooth as an arm's own interpolator makes it. The gripper's linkage moves as one, give or
-    take a hundredth of its way, and its joints together bear the driver's force. Gravity doesn't
-    act on the robot. Arm and tool may collide with each other; neighbouring links may not. The
-    friction between two bodies is the mean of their coefficients.
+    The gripper's linkage moves as one, give or take a hundredth of its way, and its joints together
+    bear the driver's force. Gravity doesn't act on the robot. Arm and tool may collide with each
+    other; neighbouring links may not. The friction between two bodies is the mean of their
+    coefficients.
 
     PhysX remembers contacts in ways that can't be saved. So every `reset` and `restore` builds the
     physics, and what follows depends on the state alone, to the bit; but the motion after a
@@ -152,7 +151,8 @@ class SapienBackend(Simulator):
                 twists={body.name: np.zeros(6) for body in scene.bodies if body.name in bodies},
                 joints={name: np.zeros(2) for name in scene.jointed},
             ),
-            np.append(robot.home, 0.0),
+            robot.home,
+            0.0,
         )
 
     def reset(self, state: SceneState) -> None:
@@ -168,14 +168,16 @@ class SapienBackend(Simulator):
                 twists={name: np.zeros(6) for name in bodies},
                 joints={k: np.array([at, 0.0]) for k, at in state.joint_positions.items()},
             ),
-            np.append(q, state.commanded_gripper),
+            q,
+            state.commanded_gripper,
         )
 
-    def _start(self, moment: _Moment, target: Array) -> None:
-        """Rebuild the physics with everything as it is at a moment, and time 0."""
+    def _start(self, moment: _Moment, q: Array, gripper: float) -> None:
+        """Rebuild the physics with all as at a moment, the targets at rest, and time 0."""
         self._now = moment
         self._physics = _Physics(self._robot, self.scene, moment, self.rates.physics_hz)
-        self._target = self._last_target = target
+        self._targets = PeriodTargets(self._model, self.rates.physics_per_control)
+        self._targets.rest_at(q, gripper)
         self._periods = 0
         self._touched: dict[tuple[str, str], tuple[float, float]] = {}
         self._joint_path: list[Array] = []
@@ -243,24 +245,20 @@ class SapienBackend(Simulator):
 
     def command(self, q: Array, gripper: float) -> CommandSent:
         self._running()
-        sent = CommandSent(self._model.check_limits(q), check_gripper(gripper))
-        self._target = np.append(sent.q, sent.gripper)
-        return sent
+        return self._targets.command(q, gripper)
 
     def step(self) -> None:
         physics = self._running()
         self._touched = {}
         self._joint_path = []
-        steps = self.rates.physics_per_control
-        for i in range(1, steps + 1):
-            target = self._last_target + (i / steps) * (self._target - self._last_target)
+        for target in self._targets.rows:
             physics.advance(target[:-1], self.robot.gripper.closed_position * float(target[-1]))
             self._joint_path.append(physics.arm_positions())
             for pair, (force, penetration) in physics.contacts().items():
                 old = self._touched.get(pair, (0.0, 0.0))
                 self._touched[pair] = max(old[0], force), max(old[1], penetration)
         self._now = physics.moment(self._now)
-        self._last_target = self._target
+        self._targets.advance()
         self._periods += 1
 
     def contacts(self) -> list[Contact]:
@@ -273,8 +271,7 @@ class SapienBackend(Simulator):
             "robot": self.robot.name,
             "scene": self._scene_digest,
             "bodies": sorted(body.name for body in self.scene.bodies),
-            "target": self._target.tolist(),
-            "last_target": self._last_target.tolist(),
+            **self._targets.to_json(),
             "periods": self._periods,
             "now": self._now.plain(),
         }
@@ -284,8 +281,8 @@ class SapienBackend(Simulator):
         self._running()
         names = sorted(body.name for body in self.scene.bodies)
         head, _ = unpack_state(self.name, state, self.robot.name, self._scene_digest, names)
-        self._start(_Moment.of(head["now"]), np.array(head["target"]))
-        self._last_target = np.array(head["last_target"])
+        self._start(_Moment.of(head["now"]), self.robot.home, 0.0)
+        self._targets.take(head)
         self._periods = int(head["periods"])
 
     def close(self) -> None:

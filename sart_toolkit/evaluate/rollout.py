@@ -138,7 +138,7 @@ def run_rollout(
     require(backend, Resets, "a rollout begins at the task's start").reset(state)
     record_hz = skill.demonstration.rates.record_hz
     rates = Rates(backend.rates.physics_hz, backend.rates.control_hz, record_hz)
-    controller = ToolController(model)
+    controller = ToolController(model, rates=rates)
     controller.reset(state.q)
     skill.reset()
     held = 0

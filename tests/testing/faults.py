@@ -143,9 +143,9 @@ class StuckJoint(PyBulletBackend):
     """The last joint ignores commands."""
 
     def command(self, q: Array, gripper: float) -> CommandSent:
-        stays = self._last_target[len(self._arm) - 1]
+        stays = self._targets.last[len(self._arm) - 1]
         sent = super().command(q, gripper)
-        self._target[len(self._arm) - 1] = stays
+        self._targets.rows[:, len(self._arm) - 1] = stays
         return sent
 
 
@@ -153,10 +153,11 @@ class LateJoints(PyBulletBackend):
     """Each period covers half of the way to the command."""
 
     def step(self) -> None:
-        commanded = self._target
-        self._target = 0.5 * (self._last_target + commanded)
+        commanded = self._targets.rows[-1]
+        half = 0.5 * (self._targets.last + commanded)
+        self._targets.rows = np.linspace(self._targets.last, half, len(self._targets.rows) + 1)[1:]
         super().step()
-        self._target = commanded
+        self._targets.rest_at(commanded[:-1], commanded[-1])
 
 
 class WrongClock(PyBulletBackend):
@@ -232,12 +233,12 @@ class InstancesShareTargets(PyBulletBackend):
 
     def command(self, q: Array, gripper: float) -> CommandSent:
         sent = super().command(q, gripper)
-        InstancesShareTargets._everybody_s = self._target
+        InstancesShareTargets._everybody_s = self._targets.rows
         return sent
 
     def step(self) -> None:
         if self._everybody_s is not None:
-            self._target = self._everybody_s
+            self._targets.rows = self._everybody_s
         super().step()
 
 
@@ -247,10 +248,10 @@ class NoisySteps(PyBulletBackend):
     _rng: ClassVar = np.random.default_rng()
 
     def step(self) -> None:
-        right = self._target
-        self._target = right + 1e-7 * self._rng.standard_normal(len(right))
+        right = self._targets.rows
+        self._targets.rows = right + 1e-7 * self._rng.standard_normal(right.shape)
         super().step()
-        self._target = right
+        self._targets.rest_at(right[-1, :-1], right[-1, -1])
 
 
 class ClippedCommands(PyBulletBackend):
@@ -267,8 +268,9 @@ class SaysItSentMore(PyBulletBackend):
 
     def command(self, q: Array, gripper: float) -> CommandSent:
         sent = super().command(q, gripper)
-        here = self._last_target[: len(self._arm)]
-        self._target[: len(self._arm)] = here + np.clip(sent.q - here, -0.05, 0.05)
+        here = self._targets.last[: len(self._arm)]
+        rows = self._targets.rows[:, : len(self._arm)]
+        rows[:] = here + np.clip(rows - here, -0.05, 0.05)
         return sent
 
 
@@ -511,9 +513,9 @@ class RestoreForgetsTargets(PyBulletBackend):
     """The command in force stays that of before the restore."""
 
     def restore(self, state: bytes) -> None:
-        target = self._target
+        targets = self._targets.rows
         super().restore(state)
-        self._target = target
+        self._targets.rows = targets
 
 
 class RestoreForgetsSpeeds(PyBulletBackend):
