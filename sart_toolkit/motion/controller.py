@@ -188,7 +188,7 @@ class ToolController:
         self._interpolator.reset(self._q)
 
     def _allowed_lag(self, measured: Array, n: int) -> Array:
-        """How much more lead [m], [rad] than usual is allowed: what is sent lags behind the command.
+        """How much more lead [m], [rad] than usual is allowed, as what is sent lags behind.
 
         Only what adds to the lead counts, and what is left of it fades.
         """
@@ -218,5 +218,5 @@ class ToolController:
 
 
 def _offsets(a: Array, b: Array) -> tuple[Array, Array]:
-    """From pose a to pose b: the way `(3,)` [m] in the world, and the rotation `(3,)` [rad] in a."""
+    """From pose a to b: the way `(3,)` [m] in the world, and the rotation `(3,)` [rad] in a."""
     return b[:3, 3] - a[:3, 3], log_rotation(a[:3, :3].T @ b[:3, :3])

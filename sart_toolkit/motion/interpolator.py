@@ -1,4 +1,4 @@
-"""Joint targets at a backend's own rate, smooth and within limits, from one goal a control period."""
+"""Joint targets at a backend's own rate, smooth and within limits, from a goal a period."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is sent to the joints: smooth, within limits whatever the goals are, and exact in the end."""
+"""What is sent to the joints: smooth, within limits whatever the goals are, exact in the end."""
 
 import hypothesis.strategies as st
 import numpy as np
