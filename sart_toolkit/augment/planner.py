@@ -10,6 +10,7 @@ from sart_toolkit.augment.strategies import Proposal
 from sart_toolkit.collision import make_world
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import MotionRejected, Unreachable
@@ -49,17 +50,31 @@ class SegmentPlanner:
         at = self._annotation.spheres[sphere]
         return strategy.propose(demonstration, at, rng, self._config.sampling), rng
 
-    def plan(self, proposal: Proposal, rng: np.random.Generator) -> tuple[Motion, Certificate]:
+    @property
+    def measured_margin(self) -> float:
+        """What a measured path has to keep free [m]: `margin`, and what bodies may have moved."""
+        return self._config.margin + BODY_STILLNESS
+
+    def plan(
+        self, proposal: Proposal, rng: np.random.Generator, tracking_error: float
+    ) -> tuple[Motion, Certificate]:
         """The motion from waypoint t* to a drawn pose, and the proof that it keeps the margin.
 
         It is the straight line if that is clear; else, where the strategy plans, one round what is
-        in the way.
+        in the way. The margin proved is `measured_margin` and the tracking error beyond it.
+
+        Args:
+            proposal: what `proposal` drew.
+            rng: the random numbers that follow it.
+            tracking_error: how far [m] any point of the robot may be from its commanded path.
 
         Raises:
             Unreachable: no joint configuration reaches some pose.
-            MotionRejected: the motion can't be proved clear, or a joint forbids it.
+            MotionRejected: the motion can't be proved clear, a joint forbids it, or something moves
+                at t*.
         """
         config, t = self._config, proposal.t_star
+        margin = self.measured_margin + tracking_error
         demonstration = self.world.demonstration
         steps, record_hz = demonstration.steps, demonstration.rates.record_hz
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
@@ -69,7 +84,7 @@ class SegmentPlanner:
             motion = straight_line(
                 self.world.kinematics, q, T, T_goal, config.duration, record_hz=record_hz
             )
-            certificate = self.world.certify(t, motion.path, config.margin)
+            certificate = self.world.certify(t, motion.path, margin)
             certificate.check_free()
         except (Unreachable, MotionRejected):
             if not get_strategy(config.strategy).plans:
@@ -79,7 +94,7 @@ class SegmentPlanner:
                 q,
                 T_goal,
                 config.duration,
-                config.margin,
+                margin,
                 rng,
                 record_hz=record_hz,
             )

@@ -130,8 +130,11 @@ class _EpisodeCheck:
             raise MotionRejected("provenance: seed, sphere and k lead to another pose or waypoint")
         if not p.certificate:
             raise MotionRejected("certificate: there is none")
-        motion, commanded = planner.plan(proposal, rng)
-        measured = planner.world.certify(p.t_star, PolylinePath(episode.joint_path))
+        declared = float(p.certificate["tracking_error"])
+        motion, commanded = planner.plan(proposal, rng, declared)
+        measured = planner.world.certify(
+            p.t_star, PolylinePath(episode.joint_path), planner.measured_margin
+        )
         deviation = path_deviation(planner.world.placed(p.t_star), motion, episode.joint_path)
         self._compare(p.certificate, "commanded", commanded)
         self._compare(p.certificate, "measured", measured)
@@ -139,6 +142,11 @@ class _EpisodeCheck:
             raise MotionRejected(
                 f"certificate: the measured path is {deviation * 1e3:.3f} mm off the commanded, "
                 f"{p.certificate['deviation'] * 1e3:.3f} mm are stated"
+            )
+        if deviation > declared + _LENGTH_TOLERANCE:
+            raise MotionRejected(
+                f"certificate: the measured path is {deviation * 1e3:.3f} mm off the commanded, "
+                f"more than the tracking error of {declared * 1e3:.3f} mm that was proved for"
             )
         self.largest_deviation = max(self.largest_deviation, deviation)
         demonstration = self._sources[p.source].demonstration

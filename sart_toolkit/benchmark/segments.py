@@ -6,7 +6,7 @@ import collections
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,7 +18,7 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, check_counts, recorded
+from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, recorded
 from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
@@ -43,14 +43,23 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class SegmentsConfig:
-    """How many segments are attempted in all, from which seed, proved clear of what obstacles."""
+    """How many segments are attempted in all, from which seeds, proved clear of what obstacles.
+
+    Each seed has a demonstration of its own in every cell, and draws of its own.
+    """
 
     count: int = 10_000
-    seed: int = 0
+    seeds: tuple[int, ...] = (0,)
     obstacles: Source = "scene"
 
     def __post_init__(self) -> None:
-        check_counts(self, "count")
+        if self.count < 1:
+            raise InvalidInput(f"count: expected at least 1, got {self.count}")
+        object.__setattr__(self, "seeds", tuple(self.seeds))
+        if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) < len(self.seeds):
+            raise InvalidInput(
+                f"seeds: expected different whole numbers >= 0, at least one, got {self.seeds}"
+            )
 
 
 @dataclass(frozen=True)
@@ -105,20 +114,21 @@ def _tool_points(model: RobotModel, configurations: Array) -> Array:
 class _Segments:
     """Makes attempts of a cell; keeps the last cell's backend, demonstration and spheres."""
 
-    def __init__(self, cells: Sequence[Cell], config: SegmentsConfig) -> None:
-        self._cells = {cell.name: cell for cell in cells}
-        self._augment = AugmentConfig(seed=config.seed, obstacles=config.obstacles, cameras=())
+    def __init__(self, cells: Mapping[str, tuple[Cell, int]], config: SegmentsConfig) -> None:
+        self._cells = cells
+        self._augment = AugmentConfig(obstacles=config.obstacles, cameras=())
         self._open: tuple[str, Backend, Annotation, SegmentPlanner, RestoreExecutor] | None = None
 
     def _opened(self, name: str) -> tuple[Annotation, SegmentPlanner, RestoreExecutor]:
         if self._open is None or self._open[0] != name:
             self.close()
-            cell = self._cells[name]
+            cell, seed = self._cells[name]
+            self._augment = replace(self._augment, seed=seed)
             backend = cell.make_backend()
             try:
                 exact = self._augment.obstacles == "scene"
                 session = WITHOUT_IMAGES if exact else SessionConfig()
-                demonstration = recorded(cell, backend, self._augment.seed, session)
+                demonstration = recorded(cell, backend, seed, session)
                 world = world_of(demonstration, backend.robot, backend.scene, self._augment)
                 annotation = suggest_annotation(demonstration, world)
                 executor = RestoreExecutor(backend, [(demonstration, annotation)], self._augment)
@@ -149,7 +159,7 @@ class _Segments:
             "measured": None,
         }
         try:
-            motion, certificate = planner.plan(proposal, rng)
+            motion, certificate = planner.plan(proposal, rng, executor.tracking_error)
         except (Unreachable, MotionRejected):
             pass
         else:
@@ -191,14 +201,15 @@ def benchmark_segments(
 ) -> dict[str, Any]:
     """How augmentation's segments perform in simulation, and whether they keep what they promise.
 
-    For each cell a demonstration of the scripted operator is recorded and spheres are suggested;
-    the attempts are shared evenly among the cells, and go round-robin over a cell's spheres. No
+    For each cell, a task on a backend with a seed, a demonstration of the scripted operator is
+    recorded and spheres are suggested; the attempts are shared evenly among the cells, and go
+    round-robin over a cell's spheres. No
     images are taken but those that the obstacles are known from. Finished attempts are kept
     beside `out` until all are done: interrupted, it resumes.
 
     Args:
-        cells: tasks on backends.
-        config: how many attempts.
+        cells: tasks on backends, each with all of the config's seeds.
+        config: how many attempts, and the seeds.
         out: JSON file to write.
         workers: processes.
         overwrite: replace `out`, and forget finished attempts.
@@ -207,22 +218,23 @@ def benchmark_segments(
 
     Raises:
         OutputExists: `out` is there and `overwrite` is false.
-        Mismatch: it was interrupted with another seed or obstacles, or a demonstration failed.
+        Mismatch: it was interrupted with other seeds or obstacles, or a demonstration failed.
         InvalidInput: there are fewer attempts than cells.
         MissingCapability: a backend can't restore states.
         CannotWrite: the disk refuses.
     """
-    if config.count < len(cells):
-        raise InvalidInput(f"count: expected at least {len(cells)}, got {config.count}")
-    share, rest = divmod(config.count, len(cells))
-    wanted = [(cell.name, i) for n, cell in enumerate(cells) for i in range(share + (n < rest))]
-    asked = {"benchmark": "segments", "seed": config.seed, "obstacles": config.obstacles}
+    named = {f"{cell.name}/{seed}": (cell, seed) for cell in cells for seed in config.seeds}
+    if config.count < len(named):
+        raise InvalidInput(f"count: expected at least {len(named)}, got {config.count}")
+    share, rest = divmod(config.count, len(named))
+    wanted = [(name, i) for n, name in enumerate(named) for i in range(share + (n < rest))]
+    asked = {"benchmark": "segments", "seeds": list(config.seeds), "obstacles": config.obstacles}
     log = ResultLog(out, asked, overwrite)
     rows = {(row["cell"], row["attempt"]): row for row in log.rows}
     missing = [item for item in wanted if item not in rows]
     done = len(wanted) - len(missing)
     kept = sum(rows[item]["outcome"] == KEPT for item in wanted if item in rows)
-    with worker_map(functools.partial(_Segments, cells, config), workers) as run:
+    with worker_map(functools.partial(_Segments, named, config), workers) as run:
         for item, row in zip(missing, run(missing), strict=True):
             rows[item] = row
             log.add(row)
@@ -231,8 +243,8 @@ def benchmark_segments(
             if progress is not None:
                 progress(done, len(wanted), kept)
     table = {
-        cell.name: _segments_summary([rows[item] for item in wanted if item[0] == cell.name])
-        for cell in cells
+        name: _segments_summary([rows[item] for item in wanted if item[0] == name])
+        for name in named
     }
     return log.finish({
         **about,
