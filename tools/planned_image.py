@@ -174,7 +174,7 @@ def _outcome(planner: SegmentPlanner, k: int) -> _Draw:
     p_sampled = proposal.T_world_sampled[:3, 3]
     started = time.perf_counter()
     try:
-        motion, certificate = planner.plan(proposal, rng)
+        motion, certificate = planner.plan(proposal, rng, backend.tracking_error)
     except Unreachable:
         return _Draw(p_sampled, None, "out of reach", False, time.perf_counter() - started)
     except MotionRejected as error:

@@ -235,7 +235,7 @@ class RestoreExecutor(SegmentExecutor):
         deviation = _micrometres_up(
             path_deviation(planner.world.placed(t_star), motion, joint_path)
         )
-        if deviation > declared:
+        if not deviation <= declared:
             raise MotionRejected(
                 f"left its path: by up to {deviation * 1e3:.2f} mm, backend "
                 f"{self._backend.name!r} declares a tracking error of {declared * 1e3:.2f} mm; "
@@ -352,7 +352,8 @@ class DisturbanceCheck:
             # The farthest that any point of the body has moved.
             moved = self._corners[name] @ change[:3, :3].T + change[:3, 3]
             far = float(np.linalg.norm(moved, axis=1).max())
-            if far > most:
+            # Written so that what is no number is rejected.
+            if not far <= most:
                 raise MotionRejected(f"{name} {what}: by {far * 1e3:.2f} mm")
 
 

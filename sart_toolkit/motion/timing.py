@@ -51,7 +51,7 @@ class Motion:
     def times(self, hz: float) -> Array:
         """The times [s] 1/hz, 2/hz, ... up to the end, evenly spread."""
         n = max(1, round(self.duration * hz))
-        return self.duration * np.arange(1, n + 1) / n
+        return self.duration * (np.arange(1, n + 1) / n)
 
     def joints(self, times: Array) -> Array:
         """Joint configurations `(k, n)` [rad] at times `(k,)` [s]."""
