@@ -293,7 +293,7 @@ def check_untouched(scene: SceneSpec, contacts: Sequence[Contact], grasped: froz
 
 
 class DisturbanceCheck:
-    """Checks, each control period, that all is still as the proofs from a waypoint take it to be."""
+    """Checks each control period that all is still as the proofs from a waypoint take it to be."""
 
     def __init__(
         self,

@@ -311,8 +311,8 @@ class Augment:
     duration: Annotated[
         float,
         arg(
-            help="Seconds each segment takes, delta, rounded up to whole recorded steps; more where "
-            "the joints need it."
+            help="Seconds each segment takes, delta, rounded up to whole recorded steps; more "
+            "where the joints need it."
         ),
     ] = 2.0
     source: _SOURCE = "scene"
@@ -470,8 +470,8 @@ class BenchmarkSegments:
     """How augmentation's segments perform: kept, touched, off their path, beyond joint limits.
 
     On each task and backend a demonstration is recorded for each seed, spheres are suggested, and
-    segments are attempted from them in turn, without images. With --source cloud spheres and segments are
-    proved against what the demonstration's camera saw, and executed in the true scene.
+    segments are attempted from them in turn, without images. With --source cloud spheres and
+    segments are proved against what the demonstration's camera saw, and executed in the true scene.
 
     Example: sart benchmark segments --tasks all --backends all --seed 101,102,103,104,105
         --count 12000 --out segments.json

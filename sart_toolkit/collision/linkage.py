@@ -12,7 +12,7 @@ import pinocchio as pin
 from sart_toolkit.collision.obstacles import hull_part
 from sart_toolkit.collision.parts import ConvexPart
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.poses import Array
+from sart_toolkit.poses import Array, inverse
 from sart_toolkit.robots.model import RobotModel
 
 # A hull may enclose this much [m] that the part never sweeps on its arc, and leave out at most this
@@ -34,14 +34,6 @@ class Sweep(NamedTuple):
     excess: tuple[float, ...]
 
 
-class _Joint(NamedTuple):
-    """A joint of the linkage: how far it moves from open to closed [rad or m], does it slide."""
-
-    index: int
-    rate: float
-    slides: bool
-
-
 class Linkage:
     """A robot's parts at any opening of its gripper, and what encloses them over a range."""
 
@@ -53,57 +45,55 @@ class Linkage:
             parts: its parts there.
 
         Raises:
-            InvalidInput: a joint of the linkage neither turns about an axis nor slides along one.
+            InvalidInput: a joint of the linkage neither turns within limits nor slides.
         """
         self._parts = tuple(parts)
         self._model = pin.buildModelFromUrdf(str(model.urdf))
         self._data = self._model.createData()
         spec = model.spec
-        self._joints: dict[int, _Joint] = {}
+        self._arm = {self._model.getJointId(name) for name in spec.arm_joints}
+        self._rates = {}
         for name, rate in spec.gripper.joint_positions(1.0).items():
-            index = self._model.getJointId(name)
-            kind = self._model.joints[index].shortname()
-            slides = kind.startswith("JointModelP")
-            if self._model.joints[index].nq != 1 or not (slides or kind.startswith("JointModelR")):
+            joint = self._model.getJointId(name)
+            kind = self._model.joints[joint].shortname()
+            turns = kind.startswith("JointModelR") and self._model.joints[joint].nq == 1
+            if not (turns or kind.startswith("JointModelP")):
                 raise InvalidInput(
                     f"{spec.name}: gripper joint {name!r} neither turns within limits nor slides; "
                     "make it revolute or prismatic"
                 )
-            self._joints[index] = _Joint(index, rate, slides)
-        self._arm = {self._model.getJointId(name) for name in spec.arm_joints}
-        self._frames = {f.name: i for i, f in enumerate(self._model.frames)}
-        # From a part's joint on the arm into its frame, where its points are known at opening 0.
-        open_ = self._frame_poses(0.0)
-        self._local = [
-            np.linalg.inv(open_[i]) if self._chain(part) else None for i, part in enumerate(parts)
-        ]
+            self._rates[joint] = rate
+        frames = {frame.name: i for i, frame in enumerate(self._model.frames)}
+        self._frames = [frames[part.body] for part in parts]
+        self._chains = [self._chain(frame) for frame in self._frames]
+        self._open = self._frame_poses(0.0)
         self._bends = [self._bend(i) for i in range(len(parts))]
 
-    def _chain(self, part: ConvexPart) -> list[int]:
-        """The joints between a part and the arm, the part's own first."""
-        frame = self._model.frames[self._frames[part.body]]
-        joint, chain = int(frame.parentJoint), []
+    def _chain(self, frame: int) -> list[int]:
+        """The joints between a frame and the arm, the frame's own first; none if none moves it."""
+        joint, chain = int(self._model.frames[frame].parentJoint), []
         while joint and joint not in self._arm:
             chain.append(joint)
             joint = int(self._model.parents[joint])
-        return chain if any(self._moves(j) for j in chain) else []
+        return chain if any(self._rates.get(joint) for joint in chain) else []
 
-    def _moves(self, joint: int) -> bool:
-        return joint in self._joints and self._joints[joint].rate != 0.0
-
+    @functools.lru_cache(maxsize=256)  # noqa: B019 - models live as long as their process
     def _frame_poses(self, gripper: float) -> dict[int, Array]:
-        """The poses `(4, 4)` of moved parts' frames on the arm's last joint before them."""
+        """The poses `(4, 4)` of the frames of parts that the gripper moves, on the arm's joint."""
         q = pin.neutral(self._model)
-        for joint in self._joints.values():
-            q[self._model.joints[joint.index].idx_q] = joint.rate * gripper
+        for joint, rate in self._rates.items():
+            q[self._model.joints[joint].idx_q] = rate * gripper
         pin.framesForwardKinematics(self._model, self._data, q)
         poses = {}
-        for i, part in enumerate(self._parts):
-            if chain := self._chain(part):
-                carrier = self._data.oMi[int(self._model.parents[chain[-1]])]
-                frame = self._data.oMf[self._frames[part.body]]
-                poses[i] = np.array(carrier.actInv(frame).homogeneous)
+        for i, (frame, chain) in enumerate(zip(self._frames, self._chains, strict=True)):
+            if chain:
+                T_world_arm = self._data.oMi[int(self._model.parents[chain[-1]])]
+                poses[i] = np.array(T_world_arm.actInv(self._data.oMf[frame]).homogeneous)
         return poses
+
+    def _move(self, i: int, gripper: float) -> Array:
+        """Where the gripper's opening brings a part from where it is open `(4, 4)`."""
+        return np.asarray(self._frame_poses(gripper)[i] @ inverse(self._open[i]))
 
     def _bend(self, i: int) -> float:
         """No less than any point of a part accelerates over the gripper's command, `A` [m].
@@ -112,45 +102,36 @@ class Linkage:
         the farthest that a point of the part is ever from it; a joint that slides at v adds
         2 v sum |w_k| over those before it that turn.
         """
-        local = self._local[i]
-        if local is None:
+        if not self._chains[i]:
             return 0.0
-        chain = self._chain(self._parts[i])
-        frame = self._model.frames[self._frames[self._parts[i].body]]
-        points = _moved(self._parts[i].points, local)
-        tip = _moved(points, np.array(frame.placement.homogeneous))
-        reach = float(np.linalg.norm(tip, axis=1).max())
-        bend, slid = 0.0, 0.0
-        # The rates at which joints nearer to the part turn, each with its reach.
-        turning: list[tuple[float, float]] = []
-        for index in chain:
-            joint = self._joints.get(index, _Joint(index, 0.0, False))
-            rate = abs(joint.rate)
-            if joint.slides:
+        frame = self._model.frames[self._frames[i]]
+        T = np.array(frame.placement.homogeneous) @ inverse(self._open[i])
+        reach = float(np.linalg.norm(_moved(self._parts[i].points, T), axis=1).max())
+        bend = slid = 0.0
+        # For the joints nearer to the part: sum |w_k| R_k.
+        turned = 0.0
+        for joint in self._chains[i]:
+            rate = abs(self._rates.get(joint, 0.0))
+            if self._model.joints[joint].shortname().startswith("JointModelP"):
                 slid += rate
-                # Ranges go beyond open and closed by their tolerance.
+                # A range may go beyond open and closed, by less than this.
                 reach += 2.0 * rate
             else:
-                bend += rate**2 * reach + 2 * rate * sum(w * r for w, r in turning)
-                bend += 2 * rate * slid
-                turning.append((rate, reach))
-            reach += float(np.linalg.norm(self._model.jointPlacements[index].translation))
+                bend += rate**2 * reach + 2 * rate * (turned + slid)
+                turned += rate * reach
+            reach += float(np.linalg.norm(self._model.jointPlacements[joint].translation))
         return bend
 
     @functools.lru_cache(maxsize=32)  # noqa: B019 - models live as long as their process
     def at(self, gripper: float) -> Sweep:
         """The parts as they are at one opening."""
-        poses = self._frame_poses(gripper)
-        parts = []
-        for i, part in enumerate(self._parts):
-            local = self._local[i]
-            if local is None:
-                parts.append(part)
-                continue
-            T = poses[i] @ local
-            points = _moved(part.points, T)
-            placed = T @ part.T_joint_part
-            parts.append(ConvexPart(part.body, part.joint, part.geometry, placed, points))
+        parts = list(self._parts)
+        for i, part in enumerate(parts):
+            if self._chains[i]:
+                T = self._move(i, gripper)
+                points = _moved(part.points, T)
+                placed = T @ part.T_joint_part
+                parts[i] = ConvexPart(part.body, part.joint, part.geometry, placed, points)
         return Sweep(tuple(parts), tuple(range(len(parts))), (0.0,) * len(parts))
 
     def over(self, low: float, high: float) -> Sweep:
@@ -159,7 +140,13 @@ class Linkage:
         Those that move are hulls of their points at openings h apart. Between these no point leaves
         the straight line from the one place to the next by more than A h^2 / 8, A as from `_bend`:
         that is their `excess`. A long range is cut, so that hulls of arcs stay slim.
+
+        Raises:
+            InvalidInput: not a range, or one far beyond open and closed.
         """
+        if not -0.5 <= low <= high <= 1.5:
+            raise InvalidInput(f"gripper: expected a range about 0 to 1, got {low} to {high}")
+        # What is a whole number of steps but for rounding stays as it is.
         return self._over(int(np.floor(low / _GRID + 1e-6)), int(np.ceil(high / _GRID - 1e-6)))
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - models live as long as their process
@@ -168,29 +155,23 @@ class Linkage:
         parts: list[ConvexPart] = []
         origins: list[int] = []
         excess: list[float] = []
-        for i, part in enumerate(self._parts):
-            local, bend = self._local[i], self._bends[i]
-            if local is None:
-                parts, origins, excess = [*parts, part], [*origins, i], [*excess, 0.0]
+        for i, (part, bend) in enumerate(zip(self._parts, self._bends, strict=True)):
+            if not self._chains[i]:
+                parts.append(part)
+                origins.append(i)
+                excess.append(0.0)
                 continue
             pieces = int(np.ceil((high - low) * np.sqrt(bend / (8 * _SAG)))) or 1
-            ends = np.linspace(low, high, pieces + 1)
-            steps = int(np.ceil((high - low) / pieces * np.sqrt(bend / (8 * _EXCESS)))) or 1
-            for a, b in zip(ends[:-1], ends[1:], strict=True):
-                openings = np.linspace(a, b, steps + 1)
-                places = [_moved(part.points, self._pose(i, g) @ local) for g in openings]
+            length = (high - low) / pieces
+            steps = int(np.ceil(length * np.sqrt(bend / (8 * _EXCESS)))) or 1
+            for start in low + length * np.arange(pieces):
+                openings = np.linspace(start, start + length, steps + 1)
+                places = [_moved(part.points, self._move(i, float(each))) for each in openings]
                 parts.append(hull_part(part.body, part.joint, np.concatenate(places)))
                 origins.append(i)
-                excess.append(bend * ((b - a) / steps) ** 2 / 8)
+                excess.append(bend * (length / steps) ** 2 / 8)
         return Sweep(tuple(parts), tuple(origins), tuple(excess))
-
-    @functools.lru_cache(maxsize=1024)  # noqa: B019 - models live as long as their process
-    def _poses(self, gripper: float) -> dict[int, Array]:
-        return self._frame_poses(gripper)
-
-    def _pose(self, i: int, gripper: float) -> Array:
-        return self._poses(float(gripper))[i]
 
 
 def _moved(points: Array, T: Array) -> Array:
-    return points @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])

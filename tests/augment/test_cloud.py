@@ -59,9 +59,7 @@ def test_a_proof_against_the_cloud_is_no_proof_against_the_scene(dataset, peg_mo
         AugmentConfig(),
     )
     episode = generated.episode(0)
-    _, exact = scene.plan(
-        *scene.proposal(episode.provenance.sphere, episode.provenance.k), 0.0
-    )
+    _, exact = scene.plan(*scene.proposal(episode.provenance.sphere, episode.provenance.k), 0.0)
     assert episode.provenance.certificate["commanded"]["pair"] != list(exact.pair)
 
 

@@ -197,9 +197,7 @@ def test_every_seed_is_a_cell_with_a_demonstration_and_draws_of_its_own(
     assert [result["cells"][name]["attempted"] for name in names] == [3, 2]
     radii = [[s["radius"] for s in result["cells"][name]["spheres"]] for name in names]
     assert radii[0] != radii[1]
-    alone = benchmark_segments(
-        [peg_cell], SegmentsConfig(2, seeds=(103,)), tmp_path / "alone.json"
-    )
+    alone = benchmark_segments([peg_cell], SegmentsConfig(2, seeds=(103,)), tmp_path / "alone.json")
     assert counted(alone)[names[1]] == counted(result)[names[1]]
 
 
@@ -286,5 +284,5 @@ def test_the_command_line_prints_a_line_for_each_cell(
     assert "2/2 kept" in result[PEG]
     with pytest.raises(SystemExit):
         main(["benchmark", "segments", *task, "--seed", "1,x", "--out", str(out), "--overwrite"])
-    assert "--seed: expected whole numbers separated by commas, got '1,x'" in capsys.readouterr().err
+    assert "--seed: expected whole numbers separated by commas" in capsys.readouterr().err
     assert {"command", "machine", "versions", "config"} <= set(json.loads(out.read_text()))

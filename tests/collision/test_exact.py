@@ -10,7 +10,6 @@ from sart_toolkit.collision.phases import IN_GRASP_SLIP
 from sart_toolkit.errors import InvalidInput, Mismatch
 from sart_toolkit.poses import inverse
 from sart_toolkit.robots import get_robot
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
 from sart_toolkit.scenes.spec import Body
 from sart_toolkit.tasks import get_task

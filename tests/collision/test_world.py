@@ -1,7 +1,6 @@
 """One interface to obstacles, whether they are known from a description or from images."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -85,15 +84,16 @@ def test_proofs_hold_for_every_opening_from_the_measured_to_the_commanded(picked
     for t, phase in enumerate(picked.phases):
         low, high = picked.openings(t)
         # What is grasped and lifted gives way, by more or less.
-        of_t = (s for s in range(t, len(picked.phases)) if not picked.phases[s].grasped)
-        for s in itertools.takewhile(lambda s: picked.phases[s].gripper == phase.gripper, of_t):
+        for s in range(t, len(steps)):
+            if picked.phases[s].gripper != phase.gripper or picked.phases[s].grasped:
+                break
             assert low <= steps.measured_gripper[s] <= high
         assert low <= steps.commanded_gripper[t] <= high
         assert high - low <= abs(steps.measured_gripper[t] - phase.gripper) + 0.02
 
 
 def test_fingers_that_close_on_a_body_are_not_clear_of_it(picked):
-    """The fingers are still apart from the toolbox as they are measured; soon they will touch it."""
+    """As they are measured they are still apart from the toolbox; soon they will touch it."""
     steps = picked.demonstration.steps
     fingers = picked.collision.robot.gripper.finger_links
     closing = next(t for t in range(len(steps)) if steps.commanded_gripper[t] > 0.5)
@@ -111,23 +111,20 @@ def test_fingers_that_close_on_a_body_are_not_clear_of_it(picked):
 
 
 def test_fingers_that_open_are_as_wide_as_they_will_be(picked, toolbox):
-    """A wall beside the open fingers: closed ones are clear of it, closed ones that open aren't."""
     steps, spec = picked.demonstration.steps, picked.collision.robot
-    q = steps.joint_positions[0]
     t = len(steps) - 1
+    commanded = steps.commanded_gripper.copy()
+    commanded[t] = 0.0
     let_go = dataclasses.replace(
-        picked.demonstration, steps=dataclasses.replace(
-            steps, commanded_gripper=np.where(np.arange(len(steps)) == t, 0.0,
-                                              steps.commanded_gripper)
-        ),
-    )  # fmt: skip
-    held, opening = picked, ExactWorld(let_go, get_robot(toolbox.robot), toolbox.scene)
+        picked.demonstration, steps=dataclasses.replace(steps, commanded_gripper=commanded)
+    )
+    opening = ExactWorld(let_go, get_robot(toolbox.robot), toolbox.scene)
 
     def width(world):
         points = [p.points for p in world.placed(t).parts if p.body in spec.gripper.finger_links]
         return float(np.ptp(np.concatenate(points), axis=0).max())
 
-    assert len(q) and width(opening) - width(held) > 0.03
+    assert width(opening) - width(picked) > 0.03
 
 
 def test_nothing_of_the_scene_but_what_was_seen_enters_a_cloud_s_certificate(
