@@ -27,7 +27,7 @@ from PIL import Image
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner
-from sart_toolkit.backends import make_backend
+from sart_toolkit.backends import get_backend, make_backend
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.records import Annotation, Demonstration, PrecisionSphere
 from sart_toolkit.data.sampling import SamplingConfig
@@ -174,7 +174,7 @@ def _outcome(planner: SegmentPlanner, k: int) -> _Draw:
     p_sampled = proposal.T_world_sampled[:3, 3]
     started = time.perf_counter()
     try:
-        motion, certificate = planner.plan(proposal, rng)
+        motion, certificate = planner.plan(proposal, rng, get_backend("pybullet").tracking_error)
     except Unreachable:
         return _Draw(p_sampled, None, "out of reach", False, time.perf_counter() - started)
     except MotionRejected as error:

@@ -44,12 +44,14 @@ _WIDE, _FEWEST_PROBES = 0.06, 0.25
 class SuggestConfig:
     """How radii are suggested.
 
-    `margin` [m] stays free everywhere; no radius is below `min_radius` or above `max_radius` [m];
+    `margin` [m] stays free everywhere: room for augmentation's own margin, the tracking error and
+    the stillness of bodies that it proves for (0.7 mm by default on our simulators). No radius is
+    below `min_radius` or above `max_radius` [m];
     `rotation_per_metre` [rad/m] is the augmentation's nu_r; `probes` is the number of poses at
     which the whole robot is checked in a wide sphere.
     """
 
-    margin: float = 0.0005
+    margin: float = 0.0008
     min_radius: float = 0.004
     max_radius: float = 0.15
     rotation_per_metre: float = ROTATION_PER_METRE

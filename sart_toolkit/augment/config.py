@@ -27,10 +27,12 @@ class AugmentConfig:
 
     `n`: trajectories in all, the demonstrations among them; `quotas` allocates the others to the
     spheres, weighted by radius, or with `allocation` "equal" all the same, as in the paper.
-    `duration` [s] is the paper's delta, the least that a segment takes. Every segment is proved to
-    keep `margin` [m] free of the `obstacles`, the bodies of the scene or the cloud that the
-    demonstration's cameras saw, even if what is grasped slips by `slip_tolerance` [m]; if any point
-    of it moves farther in the grasp the segment is rejected. `cameras`: whose images are recorded,
+    `duration` [s] is the paper's delta, the least that a segment takes, rounded up to whole
+    recorded steps. Every segment is proved to keep `margin` [m] free of the `obstacles`, the bodies
+    of the scene or the cloud that the demonstration's cameras saw: as measured, even if what is
+    grasped has slipped by `slip_tolerance` [m] and bodies have moved by `BODY_STILLNESS`; as
+    commanded, even if the robot is off its path by its backend's `tracking_error` besides. A
+    segment on which any of these was exceeded is rejected. `cameras`: whose images are recorded,
     `None` for those of the demonstration. `executor`: how segments are executed.
     `strategy` may be given as an object; its reference is kept.
     """

@@ -20,6 +20,8 @@ from sart_toolkit.backends.interface import (
     require,
 )
 from sart_toolkit.collision.certificate import Certificate
+from sart_toolkit.collision.phases import BODY_STILLNESS
+from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import Annotation, Demonstration, Episode, Provenance
 from sart_toolkit.errors import Mismatch, MotionRejected, Unreachable
@@ -31,8 +33,6 @@ from sart_toolkit.record.recorder import StepRecorder
 from sart_toolkit.registry import expect_class, resolve
 from sart_toolkit.scenes.spec import SceneSpec
 
-# By no more than this [m] may any point of a body be moved that isn't grasped.
-_MOVED = 0.001
 _FROM_STATES = "segments start from the demonstration's saved states"
 
 
@@ -69,6 +69,11 @@ class SegmentExecutor(abc.ABC):
         self._backend, self._sources, self._config = backend, sources, config
         self._planners: dict[int, SegmentPlanner] = {}
 
+    @property
+    def tracking_error(self) -> float:
+        """How far [m] the backend may be off a commanded path."""
+        return self._backend.tracking_error
+
     @classmethod
     def check(
         cls, backend: Backend, demonstrations: Sequence[Demonstration], config: AugmentConfig
@@ -93,9 +98,11 @@ class SegmentExecutor(abc.ABC):
         """The attempts with the given keys, each once, in an order of the executor's choice.
 
         What isn't proved to keep the margin is not executed. Any contact of the robot, or of what
-        it holds or has grasped there, with anything else at any physics step ends the execution; an
-        object that slips in the grasp or is moved, or a measured motion that can't be proved clear,
-        rejects the segment.
+        it holds or has grasped there, with anything else at any physics step ends the execution. So
+        does, at any control period, an object that slips in the grasp, a body that isn't where the
+        proof has it, or a gripper that is wider open or closed than the proof holds for. A measured
+        motion that is off its path by more than the backend's tracking error, or can't be proved
+        clear, rejects the segment.
         """
 
     def planner(self, source: int) -> SegmentPlanner:
@@ -151,7 +158,7 @@ class RestoreExecutor(SegmentExecutor):
         proposal, rng = planner.proposal(key.sphere, key.k)
         t_star = proposal.t_star
         try:
-            motion, certificate = planner.plan(proposal, rng)
+            motion, certificate = planner.plan(proposal, rng, self.tracking_error)
             recorder, joint_path = self._execute(planner, motion, demonstration, t_star)
             proof = self._proof(planner, motion, certificate, joint_path, t_star)
         except Unreachable as error:
@@ -187,11 +194,10 @@ class RestoreExecutor(SegmentExecutor):
         cameras = recorded_cameras(demonstration, self._config)
         recorder = StepRecorder(backend, world.kinematics, cameras)
         start = recorded = backend.observe()
+        disturbance = DisturbanceCheck(backend.scene, world, t_star, start, self._config)
         measured = [start.q[None]]
         controller.reset(
-            steps.commanded_joint_positions[t_star],
-            steps.commanded_Ts_world_tool[t_star],
-            moving=(start.q, start.dq),
+            steps.commanded_joint_positions[t_star], steps.commanded_Ts_world_tool[t_star]
         )
 
         def send(targets: Array) -> None:
@@ -202,14 +208,16 @@ class RestoreExecutor(SegmentExecutor):
             if isinstance(backend, SensesContacts):
                 check_untouched(backend.scene, backend.contacts(), grasped)
 
-        # What was on its way to the commanded pose comes to rest there.
-        while not controller.settled:
-            send(controller.hold())
+        def periods(targets: Array) -> Array:
+            return targets.reshape(-1, rates.physics_per_control, targets.shape[1])
+
+        for rows in periods(planner.approach(t_star)[1:]):
+            send(rows)
             recorded = backend.observe()
+            disturbance(recorded)
             measured.append(joint_rows(recorded))
         times = motion.times(rates.control_hz)
-        targets = motion.joints(motion.times(rates.physics_hz))
-        targets = targets.reshape(len(times), rates.physics_per_control, -1)
+        targets = periods(motion.joints(motion.times(rates.physics_hz)))
         for i, (time, rows) in enumerate(zip(times, targets, strict=True), 1):
             # As a policy will be at its own rate, held to what was measured a recorded step ago.
             controller.follow(rows, motion.T_world_tool(time), recorded.T_world_tool)
@@ -218,8 +226,8 @@ class RestoreExecutor(SegmentExecutor):
                 seen = backend.observe()
             else:
                 seen = recorded = recorder.add(controller, gripper, 0.0)
+            disturbance(seen)
             measured.append(joint_rows(seen))
-        check_undisturbed(backend.scene, grasped, start, recorded, self._config.slip_tolerance)
         return recorder, np.concatenate(measured)
 
     def _proof(
@@ -233,10 +241,23 @@ class RestoreExecutor(SegmentExecutor):
         """What is proved about a segment: of the path commanded, and of the one measured.
 
         Raises:
-            MotionRejected: the measured path can't be proved clear.
+            MotionRejected: the measured path is farther off than the backend's tracking error, or
+                can't be proved clear.
         """
-        deviation = path_deviation(planner.world.placed(t_star), motion, joint_path)
-        measured = planner.world.certify(t_star, PolylinePath(joint_path))
+        declared = self.tracking_error
+        deviation = _micrometres_up(
+            path_deviation(
+                planner.world.placed(t_star), planner.approach(t_star), motion, joint_path
+            )
+        )
+        if not deviation <= declared:
+            raise MotionRejected(
+                f"left its path: by up to {deviation * 1e3:.2f} mm, backend "
+                f"{self._backend.name!r} declares a tracking error of {declared * 1e3:.2f} mm; "
+                "allow more time"
+            )
+        margin = planner.measured_margin
+        measured = planner.world.certify(t_star, PolylinePath(joint_path), margin)
         if measured.verdict != "free":
             raise MotionRejected(
                 f"left its path {' / '.join(measured.pair)}: by {deviation * 1e3:.1f} mm, "
@@ -245,7 +266,9 @@ class RestoreExecutor(SegmentExecutor):
         return {
             "commanded": certificate.to_json(),
             "measured": measured.to_json(),
-            "deviation": _micrometres_up(deviation),
+            "deviation": deviation,
+            "tracking_error": declared,
+            "body_stillness": BODY_STILLNESS,
             "duration": motion.duration,
         }
 
@@ -284,33 +307,69 @@ def check_untouched(scene: SceneSpec, contacts: Sequence[Contact], grasped: froz
         raise MotionRejected(f"contact {hits[0][0]} / {hits[0][1]}: stopped there")
 
 
-def check_undisturbed(
-    scene: SceneSpec,
-    grasped: frozenset[str],
-    start: Observation,
-    end: Observation,
-    slip_tolerance: float,
-) -> None:
-    """Return if what is grasped stayed in the grasp and all else where it was.
+class DisturbanceCheck:
+    """Checks each control period that all is still as the proofs from a waypoint take it to be."""
 
-    Raises:
-        MotionRejected: it didn't.
-    """
-    for body in scene.bodies:
-        if body.mass is None or body.name not in start.Ts_world_body:
-            continue
-        Ts = [seen.Ts_world_body[body.name] for seen in (start, end)]
-        most = _MOVED
-        if body.name in grasped:
-            most = slip_tolerance
-            Ts = [inverse(seen.T_world_tool) @ T for seen, T in zip((start, end), Ts, strict=True)]
-        # The farthest that any point of the body has moved.
-        corners = np.concatenate([shape.corners() for shape in body.shapes])
-        moved = corners @ (Ts[1] - Ts[0])[:3, :3].T + (Ts[1] - Ts[0])[:3, 3]
-        far = float(np.linalg.norm(moved, axis=1).max())
-        if far > most:
-            what = "slipped in the grasp" if body.name in grasped else "was moved"
-            raise MotionRejected(f"{body.name} {what}: by {far * 1e3:.1f} mm")
+    def __init__(
+        self,
+        scene: SceneSpec,
+        world: CollisionWorld,
+        t: int,
+        start: Observation,
+        config: AugmentConfig,
+    ) -> None:
+        """Compare with how things stood at waypoint `t`.
+
+        Args:
+            scene: the bodies that are watched, as far as the backend knows where they are.
+            world: what was proved about.
+            t: the waypoint.
+            start: what was measured before anything moved. It stands in for the demonstration,
+                where that doesn't tell where bodies were.
+            config: says how far an object may slip in the grasp.
+        """
+        demonstration = world.demonstration
+        self._openings = world.openings(t)
+        self._grasped = world.phases[t].grasped
+        self._slip_tolerance = config.slip_tolerance
+        self._T_world_tool = demonstration.steps.measured_Ts_world_tool[t]
+        self._Ts_world_body, self._corners = {}, {}
+        for body in scene.bodies:
+            if body.mass is None or body.name not in start.Ts_world_body:
+                continue
+            recorded = demonstration.body_Ts_world.get(body.name)
+            self._Ts_world_body[body.name] = (
+                start.Ts_world_body[body.name] if recorded is None else recorded[t]
+            )
+            self._corners[body.name] = np.concatenate([shape.corners() for shape in body.shapes])
+
+    def __call__(self, seen: Observation) -> None:
+        """Return if what is grasped stayed in the grasp, all else where it was, fingers in range.
+
+        Raises:
+            MotionRejected: it didn't.
+        """
+        low, high = self._openings
+        if not low <= seen.gripper <= high:
+            raise MotionRejected(
+                f"gripper left its range: it is at {seen.gripper:.3f}, the proof is for "
+                f"{low:.3f} to {high:.3f}"
+            )
+        for name, T in self._Ts_world_body.items():
+            change = seen.Ts_world_body[name] - T
+            most, what = BODY_STILLNESS, "was moved"
+            if name in self._grasped:
+                most, what = self._slip_tolerance, "slipped in the grasp"
+                change = (
+                    inverse(seen.T_world_tool) @ seen.Ts_world_body[name]
+                    - inverse(self._T_world_tool) @ T
+                )
+            # The farthest that any point of the body has moved.
+            moved = self._corners[name] @ change[:3, :3].T + change[:3, 3]
+            far = float(np.linalg.norm(moved, axis=1).max())
+            # Written so that what is no number is rejected.
+            if not far <= most:
+                raise MotionRejected(f"{name} {what}: by {far * 1e3:.2f} mm")
 
 
 def joint_rows(seen: Observation) -> Array:

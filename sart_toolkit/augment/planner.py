@@ -10,11 +10,13 @@ from sart_toolkit.augment.strategies import Proposal
 from sart_toolkit.collision import make_world
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
+from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import MotionRejected, Unreachable
+from sart_toolkit.motion.controller import settling_targets
 from sart_toolkit.motion.line import straight_line
-from sart_toolkit.motion.path import nearest_on_polyline
+from sart_toolkit.motion.path import PolylinePath, nearest_on_polyline
 from sart_toolkit.motion.planning import plan_motion
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array
@@ -37,6 +39,7 @@ class SegmentPlanner:
         """Plan for a robot among the obstacles of a demonstration, the dataset's `source`-th."""
         self.world = world
         self._annotation, self._config, self._source = annotation, config, source
+        self._approaches: dict[int, Array] = {}
 
     def proposal(self, sphere: int, k: int) -> tuple[Proposal, np.random.Generator]:
         """The k-th draw from a sphere, and the random numbers that follow.
@@ -49,27 +52,60 @@ class SegmentPlanner:
         at = self._annotation.spheres[sphere]
         return strategy.propose(demonstration, at, rng, self._config.sampling), rng
 
-    def plan(self, proposal: Proposal, rng: np.random.Generator) -> tuple[Motion, Certificate]:
+    @property
+    def measured_margin(self) -> float:
+        """What a measured path has to keep free [m]: `margin`, and what bodies may have moved."""
+        return self._config.margin + BODY_STILLNESS
+
+    def approach(self, t: int) -> Array:
+        """The joint targets `(m, n)` [rad], one a physics step, before a segment from waypoint `t`.
+
+        They lead from where the joints were measured, and as fast as they moved, to a rest at the
+        pose that was commanded: what is sent lags behind the command.
+        """
+        if t not in self._approaches:
+            steps = self.world.demonstration.steps
+            self._approaches[t] = settling_targets(
+                self.world.kinematics,
+                steps.commanded_joint_positions[t],
+                (steps.joint_positions[t], steps.joint_velocities[t]),
+                self.world.demonstration.rates,
+            )
+        return self._approaches[t]
+
+    def plan(
+        self, proposal: Proposal, rng: np.random.Generator, tracking_error: float
+    ) -> tuple[Motion, Certificate]:
         """The motion from waypoint t* to a drawn pose, and the proof that it keeps the margin.
 
         It is the straight line if that is clear; else, where the strategy plans, one round what is
-        in the way.
+        in the way. The proof is of the `approach` too. The margin proved is `measured_margin` and
+        the tracking error beyond it.
+
+        Args:
+            proposal: what `proposal` drew.
+            rng: the random numbers that follow it.
+            tracking_error: how far [m] any point of the robot may be from its commanded path.
 
         Raises:
             Unreachable: no joint configuration reaches some pose.
-            MotionRejected: the motion can't be proved clear, or a joint forbids it.
+            MotionRejected: the motion can't be proved clear, a joint forbids it, or something moves
+                at t*.
         """
         config, t = self._config, proposal.t_star
+        margin = self.measured_margin + tracking_error
         demonstration = self.world.demonstration
         steps, record_hz = demonstration.steps, demonstration.rates.record_hz
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
         T_goal = proposal.T_world_sampled
         self.world.check_known(t)
+        approach = self.world.certify(t, PolylinePath(self.approach(t)), margin)
+        approach.check_free()
         try:
             motion = straight_line(
                 self.world.kinematics, q, T, T_goal, config.duration, record_hz=record_hz
             )
-            certificate = self.world.certify(t, motion.path, config.margin)
+            certificate = self.world.certify(t, motion.path, margin)
             certificate.check_free()
         except (Unreachable, MotionRejected):
             if not get_strategy(config.strategy).plans:
@@ -79,11 +115,11 @@ class SegmentPlanner:
                 q,
                 T_goal,
                 config.duration,
-                config.margin,
+                margin,
                 rng,
                 record_hz=record_hz,
             )
-        return motion, certificate
+        return motion, min(certificate, approach, key=lambda proof: proof.clearance)
 
 
 def world_of(
@@ -98,14 +134,18 @@ def world_of(
     return make_world(config.obstacles, demonstration, robot, scene, config.slip_tolerance)
 
 
-def path_deviation(placed: PlacedModel, motion: Motion, joint_path: Array) -> float:
-    """How far [m] any point of the robot was, at most, from where the motion's path has it.
+def path_deviation(
+    placed: PlacedModel, approach: Array, motion: Motion, joint_path: Array
+) -> float:
+    """How far [m] any point of the robot was, at most, from the path that was commanded.
 
-    Each measured configuration of `joint_path (m, n)` is compared with the nearest of the path:
-    sum_j R_j |dq_j|, R_j being the farthest that a point of the robot can be from joint j.
+    Each measured configuration of `joint_path (m, n)` is compared with the nearest of the path,
+    the `approach (k, n)` and then the motion's: sum_j R_j |dq_j|, R_j being the farthest that a
+    point of the robot can be from joint j.
     """
     # In these units of length all joints count alike.
     reach = placed.bounds.reach.max(0, initial=0.0)
-    on_path = motion.path.positions(np.linspace(0.0, 1.0, _PATH_SAMPLES)) * reach
+    along = motion.path.positions(np.linspace(0.0, 1.0, _PATH_SAMPLES))
+    on_path = np.concatenate([approach, along]) * reach
     measured = joint_path * reach
     return float(np.abs(measured - nearest_on_polyline(measured, on_path)).sum(1).max())

@@ -12,6 +12,7 @@ import numpy as np
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner, path_deviation, world_of
 from sart_toolkit.collision.certificate import Certificate
+from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.dataset import SUMMARY, Dataset, load_dataset
 from sart_toolkit.data.manifest import EpisodeEntry
 from sart_toolkit.data.records import (
@@ -130,15 +131,29 @@ class _EpisodeCheck:
             raise MotionRejected("provenance: seed, sphere and k lead to another pose or waypoint")
         if not p.certificate:
             raise MotionRejected("certificate: there is none")
-        motion, commanded = planner.plan(proposal, rng)
-        measured = planner.world.certify(p.t_star, PolylinePath(episode.joint_path))
-        deviation = path_deviation(planner.world.placed(p.t_star), motion, episode.joint_path)
+        declared = _stated_length(p.certificate, "tracking_error")
+        if _stated_length(p.certificate, "body_stillness") != BODY_STILLNESS:
+            raise MotionRejected(
+                f"certificate: proved for bodies that move by other than {BODY_STILLNESS * 1e3} mm"
+            )
+        motion, commanded = planner.plan(proposal, rng, declared)
+        measured = planner.world.certify(
+            p.t_star, PolylinePath(episode.joint_path), planner.measured_margin
+        )
+        placed, approach = planner.world.placed(p.t_star), planner.approach(p.t_star)
+        deviation = path_deviation(placed, approach, motion, episode.joint_path)
         self._compare(p.certificate, "commanded", commanded)
         self._compare(p.certificate, "measured", measured)
-        if abs(p.certificate["deviation"] - deviation) > _LENGTH_TOLERANCE:
+        stated = _stated_length(p.certificate, "deviation")
+        if abs(stated - deviation) > _LENGTH_TOLERANCE:
             raise MotionRejected(
                 f"certificate: the measured path is {deviation * 1e3:.3f} mm off the commanded, "
-                f"{p.certificate['deviation'] * 1e3:.3f} mm are stated"
+                f"{stated * 1e3:.3f} mm are stated"
+            )
+        if not deviation <= declared + _LENGTH_TOLERANCE:
+            raise MotionRejected(
+                f"certificate: the measured path is {deviation * 1e3:.3f} mm off the commanded, "
+                f"more than the tracking error of {declared * 1e3:.3f} mm that was proved for"
             )
         self.largest_deviation = max(self.largest_deviation, deviation)
         demonstration = self._sources[p.source].demonstration
@@ -158,6 +173,14 @@ class _EpisodeCheck:
                 f"{claim.clearance * 1e3:.3f} mm are stated"
             )
         self.least_clearance = min(self.least_clearance, found.clearance)
+
+
+def _stated_length(proof: Mapping[str, Any], name: str) -> float:
+    """A length [m] that a proof states."""
+    value = proof.get(name)
+    if not isinstance(value, int | float) or not 0 <= value < np.inf:
+        raise MotionRejected(f"certificate: {name}: expected a length >= 0 m, got {value!r}")
+    return float(value)
 
 
 def _check_reversal(episode: Episode, motion: Motion, model: RobotModel, record_hz: int) -> None:

@@ -92,10 +92,14 @@ class Backend(abc.ABC):
         image_size: width and height of images [pixels].
         rates: how often it is commanded, measured and recorded.
         no_images: why `observe` takes no images (here); empty where it does.
+        tracking_error: how far [m] any point of the robot may be from the path of joints that it is
+            commanded, as long as nothing touches it. Augmented segments are proved clear with that
+            much more room, and one on which it was exceeded is rejected.
     """
 
     name: str
     no_images: str = ""
+    tracking_error: float = 1e-3
 
     def __init__(
         self,

@@ -76,6 +76,8 @@ class PyBulletBackend(Simulator):
     name = "pybullet"
     drift = 0.0
     drift_deg = 0.0
+    # With a heavy object in the grasp 0.29 mm were measured, free 0.23 mm.
+    tracking_error = 4e-4
 
     def __init__(
         self,

@@ -121,6 +121,8 @@ class SapienBackend(Simulator):
     name = "sapien"
     drift = 1e-3
     drift_deg = 0.2
+    # 0.23 mm were measured, free or with an object in the grasp.
+    tracking_error = 4e-4
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ import collections
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,113 +18,69 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
-from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, check_counts, recorded
+from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, recorded
+from sart_toolkit.benchmark.limits import SentTargets
 from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     Annotation,
-    Rates,
     library_versions,
 )
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
-from sart_toolkit.motion.path import nearest_on_polyline
-from sart_toolkit.motion.timing import Motion
-from sart_toolkit.poses import Array
 from sart_toolkit.record.session import SessionConfig
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.workers import worker_map
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
-# Rounding lets a timing that just meets a limit exceed it by less than this fraction.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class SegmentsConfig:
-    """How many segments are attempted in all, from which seed, proved clear of what obstacles."""
+    """How many segments are attempted in all, from which seeds, proved clear of what obstacles.
+
+    Each seed has a demonstration of its own in every cell, and draws of its own.
+    """
 
     count: int = 10_000
-    seed: int = 0
+    seeds: tuple[int, ...] = (0,)
     obstacles: Source = "scene"
 
     def __post_init__(self) -> None:
-        check_counts(self, "count")
-
-
-@dataclass(frozen=True)
-class LimitCheck:
-    """How a motion compares with the robot's limits, and what is commanded against its path.
-
-    `ratios`: the greatest joint velocity, acceleration and jerk over their limits, at any physics
-    step; `violations`: how many of these samples, joints counted singly, exceed theirs. `off` [m]:
-    how far the tool is at most from the path at what the backend commands at each physics step.
-    """
-
-    ratios: tuple[float, float, float]
-    violations: int
-    off: float
-
-
-def check_motion(model: RobotModel, motion: Motion, q_start: Array, rates: Rates) -> LimitCheck:
-    """A motion's joint velocities, accelerations and jerks, and its commands, at each physics step.
-
-    Args:
-        model: the robot.
-        motion: what is commanded, its joints straight between control periods.
-        q_start: joints `(n,)` commanded before.
-        rates: how often it is commanded, and how often physics moves it.
-    """
-    spec = model.spec
-    limits = np.array([spec.velocity_limits, spec.acceleration_limits, spec.jerk_limits])
-    times = np.concatenate([[0.0], motion.times(rates.physics_hz)])
-    ratios = np.abs(motion.derivatives(times)) / limits[:, None]
-    targets = np.concatenate([q_start[None], motion.joints(motion.times(rates.control_hz))])
-    per_target = rates.physics_per_control
-    fraction = np.arange(1, per_target + 1)[:, None] / per_target
-    commanded = targets[:-1, None] + fraction * np.diff(targets, axis=0)[:, None]
-    commanded = commanded.reshape(-1, len(q_start))
-    v, a, j = (float(ratio) for ratio in ratios.max((1, 2)))
-    violations = int((ratios > 1.0 + _ROUNDING).sum())
-    return LimitCheck((v, a, j), violations, tool_off_path(model, motion, commanded, rates))
-
-
-def tool_off_path(model: RobotModel, motion: Motion, configurations: Array, rates: Rates) -> float:
-    """How far [m] the tool is at most from a motion's path, at configurations `(k, n)`."""
-    on_path = motion.joints(np.concatenate([[0.0], motion.times(rates.physics_hz)]))
-    points = _tool_points(model, configurations)
-    off = points - nearest_on_polyline(points, _tool_points(model, on_path))
-    return float(np.linalg.norm(off, axis=1).max())
-
-
-def _tool_points(model: RobotModel, configurations: Array) -> Array:
-    return np.array([model.fk(q)[:3, 3] for q in configurations])
+        if self.count < 1:
+            raise InvalidInput(f"count: expected at least 1, got {self.count}")
+        object.__setattr__(self, "seeds", tuple(self.seeds))
+        if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) < len(self.seeds):
+            raise InvalidInput(
+                f"seeds: expected different whole numbers >= 0, at least one, got {self.seeds}"
+            )
 
 
 class _Segments:
     """Makes attempts of a cell; keeps the last cell's backend, demonstration and spheres."""
 
-    def __init__(self, cells: Sequence[Cell], config: SegmentsConfig) -> None:
-        self._cells = {cell.name: cell for cell in cells}
-        self._augment = AugmentConfig(seed=config.seed, obstacles=config.obstacles, cameras=())
+    def __init__(self, cells: Mapping[str, tuple[Cell, int]], config: SegmentsConfig) -> None:
+        self._cells = cells
+        self._augment = AugmentConfig(obstacles=config.obstacles, cameras=())
         self._open: tuple[str, Backend, Annotation, SegmentPlanner, RestoreExecutor] | None = None
 
     def _opened(self, name: str) -> tuple[Annotation, SegmentPlanner, RestoreExecutor]:
         if self._open is None or self._open[0] != name:
             self.close()
-            cell = self._cells[name]
+            cell, seed = self._cells[name]
+            self._augment = replace(self._augment, seed=seed)
             backend = cell.make_backend()
             try:
                 exact = self._augment.obstacles == "scene"
                 session = WITHOUT_IMAGES if exact else SessionConfig()
-                demonstration = recorded(cell, backend, self._augment.seed, session)
+                demonstration = recorded(cell, backend, seed, session)
                 world = world_of(demonstration, backend.robot, backend.scene, self._augment)
                 annotation = suggest_annotation(demonstration, world)
                 executor = RestoreExecutor(backend, [(demonstration, annotation)], self._augment)
             except BaseException:
                 backend.close()
                 raise
+            self._sent = SentTargets(backend)
             self._open = name, backend, annotation, executor.planner(0), executor
         return self._open[2:]
 
@@ -135,8 +91,7 @@ class _Segments:
         sphere = annotation.spheres[at]
         started = time.perf_counter()
         proposal, rng = planner.proposal(at, k)
-        model, demonstration = planner.world.kinematics, planner.world.demonstration
-        motion: Motion | None = None
+        demonstration = planner.world.demonstration
         row: dict[str, Any] = {
             "cell": name,
             "attempt": number,
@@ -146,31 +101,29 @@ class _Segments:
             "radius": sphere.radius,
             "limited_by": sphere.limited_by,
             "planned": None,
+            "sent": None,
             "measured": None,
         }
         try:
-            motion, certificate = planner.plan(proposal, rng)
+            motion, certificate = planner.plan(proposal, rng, executor.tracking_error)
         except (Unreachable, MotionRejected):
             pass
         else:
-            commanded = demonstration.steps.commanded_joint_positions
-            found = check_motion(model, motion, commanded[proposal.t_star], demonstration.rates)
             row["planned"] = {
                 "clearance": certificate.clearance,
                 "duration": motion.duration,
                 "lengthened": motion.duration > self._augment.duration,
-                **asdict(found),
             }
         attempt = executor.attempt(AttemptKey(0, at, k))
         row["outcome"] = attempt.outcome
-        if attempt.episode is not None and motion is not None:
+        steps, t = demonstration.steps, proposal.t_star
+        sent = self._sent.check(steps.joint_positions[t], steps.joint_velocities[t])
+        row["sent"] = None if sent is None else asdict(sent)
+        if attempt.episode is not None:
             proof = attempt.episode.provenance.certificate or {}
             row["measured"] = {
                 "clearance": proof["measured"]["clearance"],
                 "deviation": proof["deviation"],
-                "off": tool_off_path(
-                    model, motion, attempt.episode.joint_path, demonstration.rates
-                ),
             }
         return row | {"wall": time.perf_counter() - started}
 
@@ -191,14 +144,16 @@ def benchmark_segments(
 ) -> dict[str, Any]:
     """How augmentation's segments perform in simulation, and whether they keep what they promise.
 
-    For each cell a demonstration of the scripted operator is recorded and spheres are suggested;
-    the attempts are shared evenly among the cells, and go round-robin over a cell's spheres. No
-    images are taken but those that the obstacles are known from. Finished attempts are kept
-    beside `out` until all are done: interrupted, it resumes.
+    For each cell, a task on a backend with a seed, a demonstration of the scripted operator is
+    recorded and spheres are suggested; the attempts are shared evenly among the cells, and go
+    round-robin over a cell's spheres. What is sent to the joints is held against the robot's
+    limits, by finite differences at the physics rate. No images are taken but those that the
+    obstacles are known from. Finished attempts are kept beside `out` until all are done:
+    interrupted, it resumes.
 
     Args:
-        cells: tasks on backends.
-        config: how many attempts.
+        cells: tasks on backends, each with all of the config's seeds.
+        config: how many attempts, and the seeds.
         out: JSON file to write.
         workers: processes.
         overwrite: replace `out`, and forget finished attempts.
@@ -207,22 +162,23 @@ def benchmark_segments(
 
     Raises:
         OutputExists: `out` is there and `overwrite` is false.
-        Mismatch: it was interrupted with another seed or obstacles, or a demonstration failed.
+        Mismatch: it was interrupted with other seeds or obstacles, or a demonstration failed.
         InvalidInput: there are fewer attempts than cells.
         MissingCapability: a backend can't restore states.
         CannotWrite: the disk refuses.
     """
-    if config.count < len(cells):
-        raise InvalidInput(f"count: expected at least {len(cells)}, got {config.count}")
-    share, rest = divmod(config.count, len(cells))
-    wanted = [(cell.name, i) for n, cell in enumerate(cells) for i in range(share + (n < rest))]
-    asked = {"benchmark": "segments", "seed": config.seed, "obstacles": config.obstacles}
+    named = {f"{cell.name}/{seed}": (cell, seed) for cell in cells for seed in config.seeds}
+    if config.count < len(named):
+        raise InvalidInput(f"count: expected at least {len(named)}, got {config.count}")
+    share, rest = divmod(config.count, len(named))
+    wanted = [(name, i) for n, name in enumerate(named) for i in range(share + (n < rest))]
+    asked = {"benchmark": "segments", "seeds": list(config.seeds), "obstacles": config.obstacles}
     log = ResultLog(out, asked, overwrite)
     rows = {(row["cell"], row["attempt"]): row for row in log.rows}
     missing = [item for item in wanted if item not in rows]
     done = len(wanted) - len(missing)
     kept = sum(rows[item]["outcome"] == KEPT for item in wanted if item in rows)
-    with worker_map(functools.partial(_Segments, cells, config), workers) as run:
+    with worker_map(functools.partial(_Segments, named, config), workers) as run:
         for item, row in zip(missing, run(missing), strict=True):
             rows[item] = row
             log.add(row)
@@ -231,8 +187,8 @@ def benchmark_segments(
             if progress is not None:
                 progress(done, len(wanted), kept)
     table = {
-        cell.name: _segments_summary([rows[item] for item in wanted if item[0] == cell.name])
-        for cell in cells
+        name: _segments_summary([rows[item] for item in wanted if item[0] == name])
+        for name in named
     }
     return log.finish({
         **about,
@@ -256,7 +212,7 @@ def _segments_summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     alarms = [
         {key: row[key] for key in ("sphere", "k", "waypoint", "outcome")}
         for row in rows
-        if _touched(row) or _left(row) or (row["planned"] or {}).get("violations")
+        if _touched(row) or _left(row) or (row["sent"] or {}).get("violations")
     ]
     return _segments_totals(rows) | {"spheres": spheres, "alarms": alarms}
 
@@ -265,6 +221,7 @@ def _segments_totals(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     kept = sum(row["outcome"] == KEPT for row in rows)
     planned = [row["planned"] for row in rows if row["planned"] is not None]
     measured = [row["measured"] for row in rows if row["measured"] is not None]
+    sent = [row["sent"] for row in rows if row["sent"] is not None]
     return {
         "attempted": len(rows),
         "certified": len(planned),
@@ -278,14 +235,14 @@ def _segments_totals(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "least_measured_clearance_mm": _least_mm(measured, "clearance"),
         "deviation_mm": _spread_mm(measured, "deviation"),
         "limits": {
-            "motions_that_violate": sum(each["violations"] > 0 for each in planned),
+            "executed": len(sent),
+            "targets_sent": sum(each["samples"] for each in sent),
+            "motions_that_violate": sum(each["violations"] > 0 for each in sent),
             "greatest_ratio": {
-                name: max((each["ratios"][i] for each in planned), default=None)
+                name: max((each["ratios"][i] for each in sent), default=None)
                 for i, name in enumerate(("velocity", "acceleration", "jerk"))
             },
         },
-        "commands_off_path_mm": _spread_mm(planned, "off"),
-        "measured_off_path_mm": _spread_mm(measured, "off"),
         "lengthened": sum(each["lengthened"] for each in planned),
         "longest_seconds": max((each["duration"] for each in planned), default=None),
         "tries_per_second_and_process": len(rows) / sum(row["wall"] for row in rows),

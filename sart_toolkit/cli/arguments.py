@@ -227,7 +227,7 @@ class Suggest:
     robot: _NOTED_ROBOT = None
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
-    margin: _TOOL_MARGIN = 0.0005
+    margin: _TOOL_MARGIN = 0.0008
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
     max_radius: _MAX_RADIUS = 0.15
@@ -267,7 +267,7 @@ class Annotate:
     robot: _NOTED_ROBOT = None
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
-    margin: _TOOL_MARGIN = 0.0005
+    margin: _TOOL_MARGIN = 0.0008
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
     max_radius: _MAX_RADIUS = 0.15
@@ -309,11 +309,19 @@ class Augment:
         float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")
     ] = 2.0
     duration: Annotated[
-        float, arg(help="Seconds each segment takes, delta; more where the joints need it.")
+        float,
+        arg(
+            help="Seconds each segment takes, delta, rounded up to whole recorded steps; more "
+            "where the joints need it."
+        ),
     ] = 2.0
     source: _SOURCE = "scene"
     margin: Annotated[
-        float, arg(help="Distance that every segment is proved to keep free [m].")
+        float,
+        arg(
+            help="Distance that every segment is proved to keep free [m], the backend's tracking "
+            "error and what bodies may move not counted."
+        ),
     ] = 0.0002
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     seed: _SEED = 0
@@ -461,12 +469,12 @@ class BenchmarkReplay:
 class BenchmarkSegments:
     """How augmentation's segments perform: kept, touched, off their path, beyond joint limits.
 
-    On each task and backend a demonstration is recorded, spheres are suggested, and segments are
-    attempted from them in turn, without images. With --source cloud spheres and segments are
-    proved against what the demonstration's camera saw, and executed in the true scene.
+    On each task and backend a demonstration is recorded for each seed, spheres are suggested, and
+    segments are attempted from them in turn, without images. With --source cloud spheres and
+    segments are proved against what the demonstration's camera saw, and executed in the true scene.
 
-    Example: sart benchmark segments --tasks all --backends pybullet --count 10000
-        --out segments.json
+    Example: sart benchmark segments --tasks all --backends all --seed 101,102,103,104,105
+        --count 12000 --out segments.json
 
     Example: sart benchmark segments --tasks peg_in_hole --backends pybullet --source cloud
         --count 200
@@ -480,7 +488,9 @@ class BenchmarkSegments:
         10_000
     )
     source: _SOURCE = "scene"
-    seed: _SEED = 0
+    seed: Annotated[
+        str, arg(help="Comma-separated seeds of demonstrations and draws, each a cell of its own.")
+    ] = "0"
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_segments.json")
     workers: _WORKERS = 2
     overwrite: _OVERWRITE = False

@@ -20,6 +20,7 @@ from sart_toolkit.cli.info import plain
 from sart_toolkit.data.records import library_versions
 from sart_toolkit.data.storage import check_writable, read_json, write_json
 from sart_toolkit.doctor import machine
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks import TASKS, get_task
 
@@ -102,7 +103,7 @@ def segments_verb(args: BenchmarkSegments) -> Result:
     cells = _cells(args.tasks, args.backends)
     from sart_toolkit.benchmark.segments import SegmentsConfig, benchmark_segments
 
-    config = SegmentsConfig(args.count, args.seed, args.source)
+    config = SegmentsConfig(args.count, _seeds(args.seed), args.source)
     with ProgressDisplay() as progress:
         result = benchmark_segments(
             cells, config, args.out, args.workers, args.overwrite,
@@ -121,6 +122,16 @@ def segments_verb(args: BenchmarkSegments) -> Result:
     return {"benchmark": str(args.out)} | {
         name: line(row) for name, row in [*result["cells"].items(), ("all", result["total"])]
     }
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    """The seeds in a comma-separated list of whole numbers."""
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError as error:
+        raise InvalidInput(
+            f"--seed: expected whole numbers separated by commas, got {text!r}"
+        ) from error
 
 
 def radii_verb(args: BenchmarkRadii) -> Result:

@@ -89,7 +89,7 @@ class CloudWorld(CollisionWorld):
             seen = self._seen(self._run(t))
             self._placed[t] = self._collision.placed(
                 {},
-                self._opening(t),
+                self.openings(t),
                 slip_tolerance=self.slip_tolerance,
                 grasped_parts=() if seen.part is None else (seen.part,),
                 cloud=seen.obstacles,

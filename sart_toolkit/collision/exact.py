@@ -67,18 +67,25 @@ class ExactWorld(CollisionWorld):
         """How things stood at waypoint `t`.
 
         Returns:
-            The poses `(4, 4)` of the scene's bodies in the world, the gripper's opening in [0, 1],
-            and the poses in the tool frame of what was in the grasp.
+            The poses `(4, 4)` of the scene's bodies in the world, the gripper's measured opening in
+            [0, 1], and the poses in the tool frame of what was in the grasp.
         """
         Ts = {name: poses[t] for name, poses in self.demonstration.body_Ts_world.items()}
         T_tool_world = inverse(self.demonstration.steps.measured_Ts_world_tool[t])
         grasped = {name: T_tool_world @ Ts[name] for name in self.phases[t].grasped}
-        return Ts, self._opening(t), grasped
+        opening = np.clip(self.demonstration.steps.measured_gripper[t], 0.0, 1.0)
+        return Ts, float(opening), grasped
 
     def placed(self, t: int) -> PlacedModel:
-        """Robot and scene as at waypoint `t`; what was in the grasp there moves with the tool."""
+        """Robot and scene as at waypoint `t`; what was in the grasp there moves with the tool.
+
+        The fingers are wherever `openings` has them.
+        """
         if t not in self._placed:
-            self._placed[t] = self.collision.placed(*self.at(t), slip_tolerance=self.slip_tolerance)
+            Ts, _, grasped = self.at(t)
+            self._placed[t] = self.collision.placed(
+                Ts, self.openings(t), grasped, slip_tolerance=self.slip_tolerance
+            )
         return self._placed[t]
 
     def moving(self, t: int) -> str | None:

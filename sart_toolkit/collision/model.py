@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from sart_toolkit.collision.linkage import Linkage, Sweep
 from sart_toolkit.collision.obstacles import CloudObstacles
 from sart_toolkit.collision.parts import (
     ConvexPart,
@@ -19,9 +20,9 @@ from sart_toolkit.collision.parts import (
     robot_parts,
 )
 from sart_toolkit.errors import InvalidInput, unknown_name
-from sart_toolkit.poses import Array, check_pose, frozen, inverse
+from sart_toolkit.poses import Array, check_pose, frozen
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.robots.spec import RobotSpec, check_gripper
 from sart_toolkit.scenes.spec import SceneSpec
 
 CLOUD = "cloud"
@@ -102,26 +103,19 @@ class CollisionModel:
         ]
         home = _link_poses(self.kinematics)
         self.T_joint_tool = home[robot.tool_frame]
-        self._links = {part.body: inverse(home[part.body]) for part in self._parts}
-        self._self_pairs = self._free_at_home(self._robot_parts(0.0))
+        self._linkage = Linkage(self.kinematics, self._parts)
+        self._self_pairs = self._free_at_home(self._linkage.at(0.0).parts)
 
-    @functools.lru_cache(maxsize=32)  # noqa: B019 - models live as long as their process
-    def _robot_parts(self, gripper: float) -> list[ConvexPart]:
-        """The robot's parts with its gripper at an opening."""
-        poses = _link_poses(RobotModel(self.robot, self.scene.held, gripper))
-        parts = []
-        for part in self._parts:
-            T = poses[part.body] @ self._links[part.body]
-            points = part.points @ T[:3, :3].T + T[:3, 3]
-            parts.append(
-                ConvexPart(part.body, part.joint, part.geometry, T @ part.T_joint_part, points)
-            )
-        return parts
+    def _swept(self, gripper: float | tuple[float, float]) -> Sweep:
+        """The robot's parts with its gripper at an opening, or what encloses them over a range."""
+        if isinstance(gripper, tuple):
+            return self._linkage.over(*gripper)
+        return self._linkage.at(round(check_gripper(float(gripper)), 4))
 
     def placed(
         self,
         Ts_world_body: Mapping[str, Array],
-        gripper: float,
+        gripper: float | tuple[float, float],
         Ts_tool_grasped: Mapping[str, Array] | None = None,
         allowed: Collection[tuple[str, str]] = (),
         slip_tolerance: float = 0.0,
@@ -132,7 +126,8 @@ class CollisionModel:
 
         Args:
             Ts_world_body: poses `(4, 4)` of the scene's bodies; a grasped one's is ignored.
-            gripper: opening in [0, 1].
+            gripper: opening in [0, 1]; or the least and the greatest of a range, which may go
+                beyond these ends: distances are then no larger than at any opening in it.
             Ts_tool_grasped: poses `(4, 4)` in the tool frame of the bodies in the grasp.
             allowed: pairs of names that may touch, about which nothing is said.
             slip_tolerance: how far [m] a grasped body may move in the grasp; all distances from it
@@ -158,7 +153,8 @@ class CollisionModel:
             if name not in known:
                 raise unknown_name("body or link", name, sorted(known))
         last = len(self.robot.arm_joints)
-        parts = list(self._robot_parts(round(float(gripper), 4)))
+        sweep = self._swept(gripper)
+        parts = list(sweep.parts)
         n_robot = len(parts)
         for name, T_body_shape, geometry, corners in self._shapes:
             if name in grasped:
@@ -170,7 +166,10 @@ class CollisionModel:
             points = corners @ T[:3, :3].T + T[:3, 3]
             parts.append(ConvexPart(name, joint, geometry, T @ T_body_shape, points))
         parts += grasped_parts
-        pairs = list(self._self_pairs)
+        of_part: dict[int, list[int]] = {}
+        for i, origin in enumerate(sweep.origins):
+            of_part.setdefault(origin, []).append(i)
+        pairs = [(i, j) for a, b in self._self_pairs for i in of_part[a] for j in of_part[b]]
         standing = [i for i in range(n_robot, len(parts)) if parts[i].joint == 0]
         moving = [i for i in range(len(parts)) if parts[i].joint > 0]
         pairs += [(i, j) for i in moving for j in standing]
@@ -187,7 +186,9 @@ class CollisionModel:
         ]
         if cloud is not None:
             pairs += [(i, len(parts)) for i in moving]
-        slip = [slip_tolerance if i in in_grasp else 0.0 for i, _ in pairs]
+        excess = dict(enumerate(sweep.excess)) | dict.fromkeys(in_grasp, slip_tolerance)
+        # Of the second of a pair only the robot's own can stand out; what stands has no excess.
+        slip = [excess[i] + excess.get(j, 0.0) for i, j in pairs]
         return PlacedModel(self.kinematics, parts, pairs, self.T_joint_tool, slip, cloud)
 
     def _free_at_home(self, parts: Sequence[ConvexPart]) -> list[tuple[int, int]]:

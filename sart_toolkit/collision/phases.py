@@ -13,6 +13,14 @@ from sart_toolkit.scenes.spec import SceneSpec
 # PyBullet and 0.23 mm in SAPIEN, by more in wide ones. A segment on which it moves farther is
 # rejected.
 IN_GRASP_SLIP = 0.005
+# How far [m] any point of a body that isn't grasped may be, on a segment, from where it was at t*:
+# what rests on a table settles by up to 0.08 mm in PyBullet. All proofs leave that much room, and a
+# segment on which one moves farther is rejected.
+BODY_STILLNESS = 0.0001
+# How far a gripper's opening may be outside of what it was at t* and what is commanded, as a share
+# of its range: one that holds a heavy object gives by up to 0.005 in PyBullet. Proofs hold for all
+# of it, and a segment on which it leaves that is rejected.
+GRIPPER_TOLERANCE = 0.006
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import numpy as np
-
 from sart_toolkit.collision.certificate import Certificate, JointPath, certify
 from sart_toolkit.collision.model import PlacedModel
-from sart_toolkit.collision.phases import demonstration_phases
+from sart_toolkit.collision.phases import GRIPPER_TOLERANCE, demonstration_phases
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.errors import Mismatch, MotionRejected
 from sart_toolkit.poses import Array
@@ -64,12 +62,28 @@ class CollisionWorld(ABC):
         """What isn't known at waypoint `t`, so that nothing can be proved there, or None."""
         return None
 
+    def openings(self, t: int) -> tuple[float, float]:
+        """The least and the greatest opening of the gripper that proofs at waypoint `t` hold for.
+
+        A segment starts with the gripper as it was measured there, and on the way it goes on to
+        what is commanded; fingers that hold an object do where it gives way. That range, and
+        `GRIPPER_TOLERANCE` beyond each of its ends, is taken as if it all happened at once.
+        """
+        steps = self.demonstration.steps
+        ends = float(steps.measured_gripper[t]), float(steps.commanded_gripper[t])
+        return min(ends) - GRIPPER_TOLERANCE, max(ends) + GRIPPER_TOLERANCE
+
     def check_known(self, t: int) -> None:
-        """Return if all is known that proofs at waypoint `t` are about.
+        """Return if all is known that proofs at waypoint `t` are about, and stands still.
 
         Raises:
-            MotionRejected: something isn't.
+            MotionRejected: something isn't, or doesn't.
         """
+        moving = self.moving(t)
+        if moving is not None:
+            raise MotionRejected(
+                f"{moving} moves: nothing can be proved at waypoint {t}; choose other waypoints"
+            )
         unknown = self.unknown(t)
         if unknown is not None:
             raise MotionRejected(
@@ -89,12 +103,8 @@ class CollisionWorld(ABC):
         """A proof that a joint path keeps clear of the obstacles of waypoint `t`, or where not.
 
         Raises:
-            MotionRejected: not all is known that there is at the waypoint.
+            MotionRejected: not all is known that there is at the waypoint, or something moves.
             InvalidInput: the margin is negative, or the path not finite.
         """
         self.check_known(t)
         return certify(self.placed(t), path, margin)
-
-    def _opening(self, t: int) -> float:
-        """The gripper's opening in [0, 1] as measured at waypoint `t`."""
-        return float(np.clip(self.demonstration.steps.measured_gripper[t], 0.0, 1.0))

@@ -217,6 +217,33 @@ class ToolController:
         return result
 
 
+def settling_targets(
+    model: RobotModel,
+    q_commanded: Array,
+    moving: tuple[Array, Array],
+    rates: Rates = DEFAULT_RATES,
+) -> Array:
+    """The joint targets `(m, n)`, one a physics step, that bring joints to rest at a command.
+
+    The first row is where the joints are; the others are whole control periods.
+
+    Args:
+        model: the robot.
+        q_commanded: where they are to rest `(n,)` [rad].
+        moving: where they are and how fast they move, `(n,)` [rad] and `(n,)` [rad/s].
+        rates: how often targets are sent.
+
+    Raises:
+        InvalidInput: not joint configurations.
+    """
+    controller = ToolController(model, rates=rates)
+    controller.reset(q_commanded, moving=moving)
+    periods = [np.array(moving[0])[None], controller.hold()]
+    while not controller.settled:
+        periods.append(controller.hold())
+    return np.concatenate(periods)
+
+
 def _offsets(a: Array, b: Array) -> tuple[Array, Array]:
     """From pose a to b: the way `(3,)` [m] in the world, and the rotation `(3,)` [rad] in a."""
     return b[:3, 3] - a[:3, 3], log_rotation(a[:3, :3].T @ b[:3, :3])

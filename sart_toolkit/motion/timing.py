@@ -19,6 +19,7 @@ _RAMP = 0.25
 _JERK_SHARE = 0.4
 _LONGEST = 600.0
 _LIMIT_MARGIN = 1e-3
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Motion:
 
     Attributes:
         path: the joint path over s in [0, 1].
-        duration: seconds, no less than was asked for.
+        duration: seconds, no less than was asked for, in whole recorded steps.
         T_at: the tool pose `(4, 4)` that a path parameter stands for.
     """
 
@@ -50,7 +51,7 @@ class Motion:
     def times(self, hz: float) -> Array:
         """The times [s] 1/hz, 2/hz, ... up to the end, evenly spread."""
         n = max(1, round(self.duration * hz))
-        return self.duration * np.arange(1, n + 1) / n
+        return self.duration * (np.arange(1, n + 1) / n)
 
     def joints(self, times: Array) -> Array:
         """Joint configurations `(k, n)` [rad] at times `(k,)` [s]."""
@@ -88,12 +89,13 @@ def timed(
 ) -> Motion:
     """The motion along a joint path that takes `duration`, or as much longer as the joints need.
 
+    It takes a whole number of recorded steps: `duration` is rounded up to these.
+
     The path parameter s rises from 0 to 1 with short jerk-limited ramps (cruise within 0.25 s:
     slow starts and ends make poor training data). The greatest |q'|, |q''| and |q'''| of the path
     bound s', s'' and s''' so that every joint's limits hold: |q'| s' <= v,
     |q'| s'' + |q''| s'^2 <= a, |q'| s''' + 3 |q''| s' s'' + |q'''| s'^3 <= j (shared/reference,
-    section 5). Where that takes longer than `duration` the motion is slowed down as a whole, to a
-    whole number of recorded steps.
+    section 5). Where that takes longer than `duration` the motion is slowed down as a whole.
 
     Args:
         model: the robot.
@@ -106,7 +108,9 @@ def timed(
         InvalidInput: duration not positive.
         MotionRejected: the path leaves the joints' ranges, or no time is enough for it.
     """
-    duration = check_positive("duration", duration, "s")
+    # What is a whole number of steps but for rounding stays as it is.
+    steps = int(np.ceil(check_positive("duration", duration, "s") * record_hz - _ROUNDING))
+    duration = max(1, steps) / record_hz
     # A spline lies within the range of its coefficients.
     low, high = path.spline.c.min(0), path.spline.c.max(0)
     over = np.maximum(model.lower + _LIMIT_MARGIN - low, high - model.upper + _LIMIT_MARGIN)
@@ -116,7 +120,7 @@ def timed(
     timing = _timing(path, model.spec, duration)
     if timing is None:
         # In recorded steps: the fewest that are enough, and some that aren't.
-        enough, few = round(_LONGEST * record_hz), int(duration * record_hz)
+        enough, few = round(_LONGEST * record_hz), max(1, steps)
         if few >= enough or _timing(path, model.spec, _LONGEST) is None:
             raise MotionRejected(
                 f"joint limits: the path needs more than {_LONGEST:.0f} s; sample nearer"

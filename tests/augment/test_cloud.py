@@ -59,7 +59,7 @@ def test_a_proof_against_the_cloud_is_no_proof_against_the_scene(dataset, peg_mo
         AugmentConfig(),
     )
     episode = generated.episode(0)
-    _, exact = scene.plan(*scene.proposal(episode.provenance.sphere, episode.provenance.k))
+    _, exact = scene.plan(*scene.proposal(episode.provenance.sphere, episode.provenance.k), 0.0)
     assert episode.provenance.certificate["commanded"]["pair"] != list(exact.pair)
 
 
@@ -67,4 +67,4 @@ def test_a_segment_that_starts_too_close_to_what_was_seen_is_rejected(annotation
     wide = dataclasses.replace(annotation.spheres[-1], radius=0.15)
     planner = SegmentPlanner(world, dataclasses.replace(annotation, spheres=(wide,)), CONFIG)
     with pytest.raises(MotionRejected, match=f"start too close peg / {CLOUD}"):
-        planner.plan(*planner.proposal(0, 0))
+        planner.plan(*planner.proposal(0, 0), 0.0)

@@ -9,8 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sart_toolkit.annotate.suggest import SuggestConfig
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.strategies import SART_PLANNED
+from sart_toolkit.backends import BACKENDS, get_backend
+from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, UnknownName
 
@@ -26,6 +29,15 @@ def test_an_unknown_allocation_is_refused():
 def test_obstacles_known_from_elsewhere_are_refused():
     with pytest.raises(UnknownName, match="unknown obstacles 'clouds': did you mean 'cloud'"):
         AugmentConfig(obstacles="clouds")
+
+
+@pytest.mark.parametrize("backend", [get_backend(name) for name in BACKENDS])
+def test_suggested_radii_leave_room_for_all_that_augmentation_proves_for(backend):
+    """And 0.05 mm for the path, which is within 0.02 mm of the line between poses in the sphere."""
+    assert (
+        SuggestConfig().margin
+        >= AugmentConfig().margin + BODY_STILLNESS + backend.tracking_error + 5e-5
+    )
 
 
 @pytest.mark.parametrize("name", ["margin", "slip_tolerance"])

@@ -22,6 +22,8 @@ from sart_toolkit.augment.executors import Attempt, RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends.interface import Contact, KnowsBodies, Resets, SavesStates
+from sart_toolkit.backends.pybullet import PyBulletBackend
+from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data import writer
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.manifest import KEPT, AttemptKey
@@ -190,7 +192,7 @@ def test_executed_again_a_kept_segment_touches_nothing_and_measures_the_same_to_
         peg_backend.restore(demonstration.states[t])
         steps = episode.steps
         proposal, rng = planner.proposal(episode.provenance.sphere, episode.provenance.k)
-        motion, _ = planner.plan(proposal, rng)
+        motion, _ = planner.plan(proposal, rng, peg_backend.tracking_error)
         outwards = motion.joints(motion.times(30))
         for i in reversed(range(len(steps))):
             for q in outwards[3 * (len(steps) - 1 - i) :][:3]:
@@ -324,15 +326,24 @@ def test_a_backend_that_reports_no_contacts_can_augment(
     assert make(AttemptKey(0, 0, 0)).outcome == KEPT
 
 
-def test_a_segment_on_which_something_else_is_moved_is_rejected(
-    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+@pytest.mark.parametrize(
+    ("far", "while_", "outcome"),
+    [
+        (2e-3, range(30, 1000), "block was moved"),
+        # So little, and it came back.
+        (1.2e-4, range(30, 33), "block was moved"),
+        (0.9e-4, range(1000), KEPT),
+    ],
+)
+def test_a_segment_on_which_something_else_is_moved_at_any_time_is_rejected(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch, far, while_, outcome
 ):
     observe, seen = peg_backend.observe, []
 
     def disturbed(*args):
         found = observe(*args)
+        at = pose([far if len(seen) in while_ else 0.0, 0, 0])
         seen.append(found)
-        at = pose([0.002 if len(seen) > 30 else 0.0, 0, 0])
         return dataclasses.replace(found, Ts_world_body={**found.Ts_world_body, "block": at})
 
     monkeypatch.setattr(peg_backend, "observe", disturbed)
@@ -345,7 +356,81 @@ def test_a_segment_on_which_something_else_is_moved_is_rejected(
     make = RestoreExecutor(
         peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig()
     ).attempt
-    assert make(AttemptKey(0, 0, 0)).outcome == "block was moved"
+    assert make(AttemptKey(0, 0, 0)).outcome == outcome
+
+
+def test_bodies_have_to_be_where_the_demonstration_has_them_from_the_start(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+):
+    """Restored elsewhere it never moves, and yet the proof is about another place."""
+    elsewhere = {
+        name: pose([2e-4, 0, 0]) @ Ts if name == "block" else Ts
+        for name, Ts in peg_demonstration.body_Ts_world.items()
+    }
+    demonstration = dataclasses.replace(peg_demonstration, body_Ts_world=elsewhere)
+    bodies = [dataclasses.replace(body, mass=1.0) for body in peg_backend.scene.bodies]
+    scene = dataclasses.replace(peg_backend.scene, bodies=tuple(bodies))
+    monkeypatch.setattr(peg_backend, "scene", scene)
+    make = RestoreExecutor(peg_backend, [(demonstration, peg_annotation)], AugmentConfig()).attempt
+    found = make(AttemptKey(0, 0, 0))
+    assert found.detail == "block was moved: by 0.20 mm"
+
+
+def test_nothing_is_planned_from_a_waypoint_at_which_a_body_moves(
+    peg_demonstration, peg_annotation, peg_backend
+):
+    drift = np.linspace(0, 0.1, len(peg_demonstration))
+    Ts = np.array([pose([x, 0, 0]) for x in drift]) @ peg_demonstration.body_Ts_world["table"]
+    moving = dataclasses.replace(
+        peg_demonstration, body_Ts_world={**peg_demonstration.body_Ts_world, "table": Ts}
+    )
+    make = RestoreExecutor(peg_backend, [(moving, peg_annotation)], AugmentConfig()).attempt
+    assert make(AttemptKey(0, 0, 0)).outcome == "table moves"
+
+
+def test_a_segment_farther_off_its_path_than_the_backend_declares_is_rejected(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+):
+    monkeypatch.setattr(peg_backend, "tracking_error", 1e-7)
+    make = RestoreExecutor(
+        peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig()
+    ).attempt
+    found = make(AttemptKey(0, 0, 0))
+    assert found.outcome == "left its path"
+    assert re.search(
+        r"by up to 0\.\d\d mm, backend 'pybullet' declares a tracking error of 0.00", found.detail
+    )
+
+
+def test_what_a_backend_declares_is_left_free_beside_the_margin(
+    peg_demonstration, peg_annotation, peg_backend, monkeypatch
+):
+    """0.1 m is more than there is between the peg and the hole."""
+    monkeypatch.setattr(peg_backend, "tracking_error", 0.1)
+    last = len(peg_annotation.spheres) - 1
+    make = RestoreExecutor(
+        peg_backend, [(peg_demonstration, peg_annotation)], AugmentConfig(margin=0.0)
+    ).attempt
+    assert "too close" in make(AttemptKey(0, last, 0)).outcome
+
+
+@pytest.mark.parametrize(("asked", "steps"), [(1.75, 18), (2.05, 21), (0.33, 4)])
+def test_any_duration_is_rounded_up_to_whole_recorded_steps_and_validates(
+    peg_demonstration, annotate, make_peg_backend, peg_model, peg_task, tmp_path, asked, steps
+):
+    config = AugmentConfig(n=3, duration=asked, cameras=())
+    dataset = augment_demonstration(
+        peg_demonstration, annotate((15, 0.01)), make_peg_backend, tmp_path / "d", config
+    )
+    for episode in dataset:
+        p = episode.provenance
+        assert p.certificate["duration"] == pytest.approx(steps / 10, abs=1e-12)
+        assert len(episode.steps) == steps
+        # The first step is at the sampled pose.
+        np.testing.assert_allclose(
+            episode.steps.commanded_Ts_world_tool[0], p.T_world_sampled, atol=1e-9
+        )
+    assert not validate_dataset(tmp_path / "d", peg_model.spec, peg_task.scene).problems
 
 
 def test_a_measured_path_that_is_not_clear_rejects_the_segment(
@@ -373,9 +458,15 @@ def test_an_episode_s_certificates_say_what_is_proved(peg_dataset):
         assert (
             proof["commanded"]["clearance"]
             >= proof["commanded"]["margin"]
-            == AugmentConfig().margin
+            == pytest.approx(AugmentConfig().margin + BODY_STILLNESS + proof["tracking_error"])
         )
-        assert 0 <= proof["deviation"] < 0.002
+        assert (
+            proof["measured"]["clearance"]
+            >= proof["measured"]["margin"]
+            == pytest.approx(AugmentConfig().margin + proof["body_stillness"])
+        )
+        assert proof["body_stillness"] == BODY_STILLNESS
+        assert 0 <= proof["deviation"] <= proof["tracking_error"] == PyBulletBackend.tracking_error
         assert len(episode.joint_path) == 1 + 2 * 240
 
 

@@ -7,13 +7,16 @@ import pytest
 
 from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.executors import RestoreExecutor
+from sart_toolkit.augment.executors import DisturbanceCheck, RestoreExecutor
 from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.backends.interface import Observation
 from sart_toolkit.collision.exact import ExactWorld
+from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import Annotation, PrecisionSphere, convergence_waypoint
 from sart_toolkit.data.storage import load_demonstration, save_demonstration
-from sart_toolkit.errors import InvalidInput
+from sart_toolkit.errors import InvalidInput, MotionRejected
+from sart_toolkit.poses import pose
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
@@ -159,6 +162,66 @@ def test_a_segment_on_which_the_object_slips_is_rejected(backend, demo, annotati
     attempt = RestoreExecutor(backend, [(demo, annotation)], config).attempt(AttemptKey(0, i, 0))
     assert attempt.outcome == "toolbox slipped in the grasp"
     assert attempt.episode is None
+
+
+def test_an_object_that_slips_on_the_way_and_comes_back_is_found(task, demo, world, grasped_at):
+    t = len(demo) - 1
+    assert grasped_at[t] == {"toolbox"}
+    start = observed(demo, t)
+    check = DisturbanceCheck(task.scene, world, t, start, AugmentConfig())
+    check(start)
+    for far in (0.0049, -0.0049):
+        check(shifted(start, far))
+    with pytest.raises(MotionRejected, match="toolbox slipped in the grasp: by 5.10 mm"):
+        check(shifted(start, 0.0051))
+    # Tool and object together may go anywhere.
+    T = pose([0.1, 0.2, 0.3])
+    together = {name: T @ at for name, at in start.Ts_world_body.items() if name == "toolbox"}
+    check(
+        dataclasses.replace(
+            start,
+            T_world_tool=T @ start.T_world_tool,
+            Ts_world_body={**start.Ts_world_body, **together},
+        )
+    )
+
+
+def test_what_stands_may_move_by_less_than_is_proved_for_and_no_more(task, demo, world):
+    start = observed(demo, 0)
+    check = DisturbanceCheck(task.scene, world, 0, start, AugmentConfig())
+    check(shifted(start, 0.99 * BODY_STILLNESS))
+    with pytest.raises(MotionRejected, match="toolbox was moved: by 0.10 mm"):
+        check(shifted(start, 1.01 * BODY_STILLNESS))
+
+
+def test_fingers_that_leave_the_range_proved_are_found(task, demo, world):
+    closing = next(t for t in range(len(demo)) if demo.steps.commanded_gripper[t] > 0.5)
+    start = observed(demo, closing)
+    check = DisturbanceCheck(task.scene, world, closing, start, AugmentConfig())
+    low, high = world.openings(closing)
+    for opening in (start.gripper, 0.5, demo.steps.commanded_gripper[closing]):
+        check(dataclasses.replace(start, gripper=opening))
+    for opening in (low - 0.001, high + 0.001, np.nan):
+        with pytest.raises(MotionRejected, match="gripper left its range: it is at"):
+            check(dataclasses.replace(start, gripper=opening))
+
+
+def observed(demo, t):
+    steps = demo.steps
+    return Observation(
+        q=steps.joint_positions[t],
+        dq=steps.joint_velocities[t],
+        gripper=float(steps.measured_gripper[t]),
+        T_world_tool=steps.measured_Ts_world_tool[t],
+        time=0.1 * t,
+        Ts_world_body={name: Ts[t] for name, Ts in demo.body_Ts_world.items()},
+    )
+
+
+def shifted(seen, far):
+    """The same with the toolbox by so much [m] elsewhere."""
+    T = pose([far, 0, 0]) @ seen.Ts_world_body["toolbox"]
+    return dataclasses.replace(seen, Ts_world_body={**seen.Ts_world_body, "toolbox": T})
 
 
 def test_a_segment_on_which_the_open_fingers_touch_the_object_is_rejected(

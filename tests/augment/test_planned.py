@@ -21,8 +21,10 @@ from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends import make_backend
+from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.exact import ExactWorld
+from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     Annotation,
@@ -47,6 +49,8 @@ _SPEC.loader.exec_module(image)
 
 DRAWS = 30
 RADIUS = 0.18
+TRACKING_ERROR = PyBulletBackend.tracking_error
+MARGIN = AugmentConfig().margin + BODY_STILLNESS + TRACKING_ERROR
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +110,7 @@ def outcomes(planner, draws):
     found = {}
     for k in draws:
         try:
-            found[k] = planner.plan(*planner.proposal(0, k))
+            found[k] = planner.plan(*planner.proposal(0, k), TRACKING_ERROR)
         except MotionRejected as error:
             found[k] = str(error)
     return found
@@ -148,7 +152,7 @@ def test_round_the_wall_every_draw_is_kept_but_those_that_touch_it_themselves(
     placed = make_planner("sart_planned").world.placed(_t_star(make_planner))
     for k in kept:
         motion, certificate = planned[k]
-        assert certificate.verdict == "free" and certificate.margin == AugmentConfig().margin
+        assert certificate.verdict == "free" and certificate.margin == MARGIN
         certify(placed, motion.path, certificate.margin).check_free()
     for k in set(planned) - set(kept):
         assert planned[k].startswith("sampled pose too close"), planned[k]

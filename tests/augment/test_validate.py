@@ -11,6 +11,7 @@ import pytest
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.validate import validate_dataset
+from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.manifest import Manifest
 from sart_toolkit.data.records import Steps
@@ -108,6 +109,20 @@ def certificate(which, **changes):
     return change
 
 
+def stated(**changes):
+    def change(episode):
+        return provenance(certificate={**episode.provenance.certificate, **changes})(episode)
+
+    return change
+
+
+def understated(episode):
+    """As if the robot had been declared to follow exactly."""
+    proof = episode.provenance.certificate
+    commanded = {**proof["commanded"], "margin": AugmentConfig().margin + BODY_STILLNESS}
+    return stated(tracking_error=0.0, commanded=commanded)(episode)
+
+
 def moved_path(episode):
     path = np.array(episode.joint_path)
     path[200:240] += 0.01
@@ -140,6 +155,12 @@ def steps(**changes):
         (certificate("measured", clearance=0.2), "measured path is proved .* 200.000 mm are"),
         (certificate("commanded", verdict="collision"), "is free, collision is stated"),
         (certificate("commanded", margin=0.0), "commanded path is proved"),
+        (understated, "more than the tracking error of 0.000 mm that was proved for"),
+        (stated(tracking_error=0.0003), "commanded path is proved"),
+        (stated(tracking_error="none"), "tracking_error: expected a length >= 0 m, got 'none'"),
+        (stated(deviation=float("nan")), "deviation: expected a length >= 0 m, got nan"),
+        (stated(body_stillness=0.0), "proved for bodies that move by other than 0.1 mm"),
+        (certificate("measured", margin=0.0), "measured path is proved"),
         (certificate("commanded", nonsense=1), "certificate: a field is missing or unknown"),
         (moved_path, r"measured path is (proved|\d+\.\d+ mm off)"),
         (folded_path, "the measured path is collision, free is stated"),

@@ -11,7 +11,7 @@ from sart_toolkit.collision.cloud import CloudConfig
 from sart_toolkit.collision.cloud_world import CloudWorld
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CLOUD
-from sart_toolkit.errors import Mismatch, UnknownName
+from sart_toolkit.errors import Mismatch, MotionRejected, UnknownName
 from sart_toolkit.motion.path import PolylinePath
 from sart_toolkit.robots import get_robot
 
@@ -69,6 +69,62 @@ def test_only_what_is_known_to_move_is_reported_to(picked, first_grasp, toolbox)
     assert blind.moving(first_grasp + 10) == "toolbox"
     seen = CloudWorld(demo, robot, toolbox.scene)
     assert all(seen.moving(t) is None for t in range(len(demo)))
+
+
+def test_nothing_is_proved_while_a_body_moves(picked, first_grasp, toolbox):
+    demo, robot = picked.demonstration, get_robot(toolbox.robot)
+    blind = ExactWorld(dataclasses.replace(demo, touching=((),) * len(demo)), robot, toolbox.scene)
+    still = PolylinePath(demo.steps.joint_positions[[0, 0]])
+    with pytest.raises(MotionRejected, match="toolbox moves: nothing can be proved at waypoint"):
+        blind.certify(first_grasp + 10, still)
+
+
+def test_proofs_hold_for_every_opening_from_the_measured_to_the_commanded(picked):
+    steps = picked.demonstration.steps
+    for t, phase in enumerate(picked.phases):
+        low, high = picked.openings(t)
+        # What is grasped and lifted gives way, by more or less.
+        for s in range(t, len(steps)):
+            if picked.phases[s].gripper != phase.gripper or picked.phases[s].grasped:
+                break
+            assert low <= steps.measured_gripper[s] <= high
+        assert low <= steps.commanded_gripper[t] <= high
+        assert high - low <= abs(steps.measured_gripper[t] - phase.gripper) + 0.02
+
+
+def test_fingers_that_close_on_a_body_are_not_clear_of_it(picked):
+    """As they are measured they are still apart from the toolbox; soon they will touch it."""
+    steps = picked.demonstration.steps
+    fingers = picked.collision.robot.gripper.finger_links
+    closing = next(t for t in range(len(steps)) if steps.commanded_gripper[t] > 0.5)
+    for t in (closing, closing + 1):
+        q = steps.joint_positions[t]
+        measured = picked.collision.placed(*picked.at(t))
+        pads = [
+            k for k in range(len(measured.pairs))
+            if measured.names(k)[0] in fingers and measured.names(k)[1] == "toolbox"
+        ]  # fmt: skip
+        assert min(measured.pair_distances(q, pads)) > 0.002
+        still = PolylinePath(np.stack([q, q]))
+        found = picked.certify(t, still)
+        assert found.verdict == "collision" and found.pair[1] == "toolbox"
+
+
+def test_fingers_that_open_are_as_wide_as_they_will_be(picked, toolbox):
+    steps, spec = picked.demonstration.steps, picked.collision.robot
+    t = len(steps) - 1
+    commanded = steps.commanded_gripper.copy()
+    commanded[t] = 0.0
+    let_go = dataclasses.replace(
+        picked.demonstration, steps=dataclasses.replace(steps, commanded_gripper=commanded)
+    )
+    opening = ExactWorld(let_go, get_robot(toolbox.robot), toolbox.scene)
+
+    def width(world):
+        points = [p.points for p in world.placed(t).parts if p.body in spec.gripper.finger_links]
+        return float(np.ptp(np.concatenate(points), axis=0).max())
+
+    assert width(opening) - width(picked) > 0.03
 
 
 def test_nothing_of_the_scene_but_what_was_seen_enters_a_cloud_s_certificate(

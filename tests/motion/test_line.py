@@ -142,7 +142,7 @@ def test_a_line_takes_its_duration_or_longer_from_rest_to_rest(model, motion, du
 
 
 def test_a_usual_line_takes_exactly_the_time_asked_for(model):
-    for duration in (1.0, 1.37, 2.0, 5.0):
+    for duration in (1.0, 1.4, 2.0, 5.0):
         assert (
             from_home(model, pose([0.05, 0.0, -0.05], [0, 0.1, 0]), duration).duration == duration
         )

@@ -105,7 +105,23 @@ def test_a_motion_is_slowed_down_no_more_than_needed(model, seed):
         assert moved(model, seed, asked).duration > asked
     # What was found to be enough is enough if it is asked for.
     assert moved(model, seed, motion.duration).duration == motion.duration
-    assert moved(model, seed, motion.duration + 0.037).duration == motion.duration + 0.037
+    assert moved(model, seed, motion.duration + 0.037).duration == pytest.approx(
+        motion.duration + 0.1, abs=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("asked", "hz", "duration"),
+    [(1.75, 10, 1.8), (2.05, 10, 2.1), (0.33, 10, 0.4), (2.0, 10, 2.0), (0.7, 10, 0.7),
+     (0.01, 10, 0.1), (1.01, 15, 16 / 15), (1.0, 15, 1.0)],
+)  # fmt: skip
+def test_a_duration_is_rounded_up_to_whole_recorded_steps(model, asked, hz, duration):
+    still = SplinePath.through(np.tile(model.spec.home, (6, 1)))
+    motion = timed(model, still, asked, T_at, hz)
+    assert motion.duration == duration
+    times = motion.times(hz)
+    np.testing.assert_allclose(times, np.arange(1, len(times) + 1) / hz, rtol=1e-12)
+    assert motion.s(times[-1]) == 1.0
 
 
 @PROPERTY
@@ -198,7 +214,7 @@ def test_joints_and_tool_are_where_the_path_parameter_says(model, seed, duration
     np.testing.assert_array_equal(motion.T_world_tool(time), T_at(s))
 
 
-@pytest.mark.parametrize(("hz", "duration", "n"), [(10, 2.0, 20), (10, 0.97, 10), (30, 1.0, 30)])
+@pytest.mark.parametrize(("hz", "duration", "n"), [(10, 2.0, 20), (10, 0.9, 9), (30, 1.0, 30)])
 def test_times_are_spread_evenly_and_end_at_the_end(model, hz, duration, n):
     motion = timed(model, SplinePath.through(np.tile(model.spec.home, (6, 1))), duration, T_at)
     times = motion.times(hz)
@@ -207,9 +223,9 @@ def test_times_are_spread_evenly_and_end_at_the_end(model, hz, duration, n):
     assert times[-1] == duration
 
 
-def test_a_motion_shorter_than_one_period_has_one_time(model):
+def test_a_motion_of_one_recorded_step_has_one_time(model):
     motion = timed(model, SplinePath.through(np.tile(model.spec.home, (6, 1))), 0.01, T_at)
-    np.testing.assert_array_equal(motion.times(10), [0.01])
+    np.testing.assert_array_equal(motion.times(10), [0.1])
 
 
 def test_the_same_path_is_timed_the_same(model):
