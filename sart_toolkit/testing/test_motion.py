@@ -37,6 +37,22 @@ def test_joints_follow_at_the_commanded_speed(bench: Bench) -> None:
     assert np.max(np.array(late)[:, arrived]) < 2 * _REACHED
 
 
+def test_several_targets_of_a_period_end_at_the_last(bench: Bench) -> None:
+    """The last of them is where the joints are when the period is over, and is what was sent."""
+    n, steps = len(bench.ready), bench.backend.rates.physics_per_control
+    speed = np.linspace(0.2, 0.6, n)
+    for i in range(12):
+        times = (i + np.arange(1, steps + 1) / steps) / bench.hz
+        rows = bench.ready + times[:, None] * speed
+        sent = bench.backend.command(rows, bench.gripper)
+        bench.backend.step()
+        assert np.shape(sent.q) == (n,)
+    bench.wait(0.3)
+    arrived = np.abs(bench.see().q - sent.q) < _REACHED
+    bench.relies_on(arrived.any(), "test_commanded_joints_are_reached")
+    np.testing.assert_array_equal(sent.q, rows[-1])
+
+
 def test_a_command_returns_what_was_sent(bench: Bench) -> None:
     """Where a robot goes no farther than it can in one step, it says so."""
     last = np.eye(len(bench.ready))[-1]
