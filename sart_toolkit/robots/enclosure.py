@@ -184,7 +184,7 @@ def enclose(parts: Sequence[Part], vertices: Array, faces: Faces) -> Enclosure:
     loose = _take_in(made, vertices, faces, _SKIN)
     added = 0
     for piece in _pieces(vertices, loose)[:_MAX_PIECES]:
-        piece = _take_in(made, vertices, piece, _SKIN)
+        piece = piece[standing_out(made, vertices, piece) > _SLACK]
         if not len(piece):
             continue
         points = vertices[np.unique(piece)]
@@ -196,7 +196,11 @@ def enclose(parts: Sequence[Part], vertices: Array, faces: Faces) -> Enclosure:
             for grown in [part.grown(points)]
         ]
         more, i, grown = min(options, key=lambda option: option[0], default=(np.inf, -1, new))
-        if options and (more <= _FATTER * new.volume or added >= _MAX_NEW_PARTS):
+        if options and (
+            more <= _FATTER * new.volume
+            or made[i].outside(points).max() <= _SKIN
+            or added >= _MAX_NEW_PARTS
+        ):
             made[i] = grown
         else:
             made.append(new)

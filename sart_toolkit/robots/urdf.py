@@ -230,7 +230,6 @@ def _compose(
     robot.append(ET.Element("link", name=spec.tool_frame))
     for body in attachments:
         robot.append(rigid_link(body.name, body.shapes, body.mass))
-    _add_armature(robot, spec)
     for kind in ("link", "joint"):
         names = [element.get("name") for element in robot.findall(kind)]
         twice = sorted({str(name) for name in names if names.count(name) > 1})
@@ -250,6 +249,7 @@ def _compose(
             mass = float(_found(inertial, "mass").get("value", ""))
             moment = 0.4 * max(mass, 1e-3) * _BALL_RADIUS**2
             inertial.append(_inertia(moment * np.eye(3)))
+    _add_armature(robot, spec)
     ET.indent(robot)
     ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)
 
@@ -303,10 +303,9 @@ def _add_armature(robot: ET.Element, spec: RobotSpec) -> None:
     moving = spec.gripper.joint_positions(0.0)
     links = {link.get("name"): link for link in robot.findall("link")}
     for joint in robot.findall("joint"):
-        child = joint.find("child")
-        if joint.get("name") not in moving or child is None or not spec.gripper.armature:
+        if joint.get("name") not in moving or not spec.gripper.armature:
             continue
-        inertial = _found(links[child.get("link")], "inertial")
+        inertial = _found(links[_found(joint, "child").get("link")], "inertial")
         part, names = (
             ("mass", ["value"])
             if joint.get("type") == "prismatic"
@@ -339,6 +338,44 @@ def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
     colour = spec.link_colours.get(name, (0.6, 0.6, 0.62, 1.0))
     # The wrist camera sees the gripper close by and the arm never.
     target = _GRIPPER_FACES if name.startswith(_GRIPPER_PREFIX) else _ARM_FACES
+    paths = [_mesh_path(mesh.get("filename", ""), base) for mesh in link.iter("mesh")]
+    digests = tuple(_digest(path) if os.path.isfile(path) else "" for path in paths)
+    text, files = _lightened(ET.tostring(link, encoding="unicode"), base, digests, target)
+    made = ET.fromstring(text)
+    link[:] = list(made)
+    # Names that no two links share, and that are safe for any file system.
+    stem = f"{number}_{re.sub(r'[^A-Za-z0-9]+', '_', name)[:40]}"
+    for mesh in link.iter("mesh"):
+        mesh.set("filename", f"{stem}_{mesh.get('filename')}")
+    for file, content in files.items():
+        (work / f"{stem}_{file}").write_bytes(content)
+    for index, element in enumerate(link.findall("visual")):
+        element.append(_material(f"{name}_{index}", colour))
+
+
+@functools.lru_cache(maxsize=128)
+def _lightened(
+    text: str, base: Path, digests: tuple[str, ...], target: int
+) -> tuple[str, dict[str, bytes]]:
+    """A link's element with light meshes, as text, and these meshes' files.
+
+    Remembered, since robots share links.
+
+    Args:
+        text: the link's element, checked.
+        base: where its meshes' paths start.
+        digests: of its meshes' contents.
+        target: about how many faces each visual mesh gets.
+    """
+    link = ET.fromstring(text)
+    with tempfile.TemporaryDirectory(prefix="sart-link-") as folder:
+        _make_light(link, base, Path(folder), target)
+        files = {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
+    return ET.tostring(link, encoding="unicode"), files
+
+
+def _make_light(link: ET.Element, base: Path, work: Path, target: int) -> None:
+    name = link.get("name", "")
     visuals, collisions = link.findall("visual"), link.findall("collision")
     if visuals and not collisions:
         raise InvalidInput(
@@ -349,15 +386,12 @@ def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
         mesh = element.find("geometry/mesh")
         if mesh is not None:
             _check_mesh(_loaded(mesh, base), name, element.tag, mesh.get("filename", ""))
-    # Names that no two links share, and that are safe for any file system.
-    stem = f"{number}_{re.sub(r'[^A-Za-z0-9]+', '_', name)[:40]}"
     source = drawn_triangles(link, base)
     solids = _collision_meshes(link, base)
     made = _enclosed(link, base, *source)
-    _write_parts(link, made.parts, work, stem)
+    _write_parts(link, made.parts, work)
     start = 0
     for index, element in enumerate(visuals):
-        element.append(_material(f"{name}_{index}", colour))
         mesh = element.find("geometry/mesh")
         if mesh is None:
             continue
@@ -365,7 +399,7 @@ def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
         owner = made.owner[start : start + len(loaded.faces)]
         start += len(loaded.faces)
         light = _light(loaded, owner, made.parts, _place(element), target, solids)
-        _export(light, mesh, work, f"{stem}_visual_{index}.obj")
+        _export(light, mesh, work, f"visual_{index}.obj")
     for vertices, faces in (source, drawn_triangles(link, work)):
         out = standing_out(link_parts(link, work), vertices, faces)
         if len(out) and out.max() > TOLERANCE:
@@ -425,7 +459,7 @@ def _enclosed(link: ET.Element, base: Path, vertices: Array, faces: Faces) -> En
     return made
 
 
-def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path, stem: str) -> None:
+def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path) -> None:
     """Let the link's collision elements be these parts; those added come last."""
     own = link.findall("collision")
     for index, part in enumerate(parts):
@@ -436,7 +470,7 @@ def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path, stem: str)
                 mesh = ET.SubElement(ET.SubElement(element, "geometry"), "mesh")
             T = np.linalg.inv(_place(element))
             hull = trimesh.Trimesh(_moved(part.points, T)).convex_hull
-            _export(hull, mesh, work, f"{stem}_collision_{index}.obj")
+            _export(hull, mesh, work, f"collision_{index}.obj")
         elif index >= len(own):
             element.append(_origin(part.shape.T_body_shape))
             element.append(_geometry(part.shape))
@@ -536,7 +570,7 @@ def _loaded(element: ET.Element, base: Path) -> trimesh.Trimesh:
     return _mesh(source, _digest(source), tuple(_floats(element.get("scale", "1 1 1"))))
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=16)
 def _mesh(source: Path, digest: str, scale: tuple[float, ...]) -> trimesh.Trimesh:
     """The mesh of a file of that content, scaled; not to be changed."""
     content = read_bytes(source, _MAX_MESH_BYTES)
