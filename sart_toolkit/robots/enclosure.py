@@ -127,9 +127,7 @@ class ShapePart:
         return (
             self.shape.kind == other.kind
             and bool(np.allclose(self.shape.size, other.size, rtol=0, atol=_SLACK))
-            and bool(
-                np.allclose(self.shape.T_body_shape, other.T_body_shape, rtol=0, atol=_SLACK)
-            )
+            and bool(np.allclose(self.shape.T_body_shape, other.T_body_shape, rtol=0, atol=_SLACK))
         )
 
 

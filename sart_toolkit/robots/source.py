@@ -271,7 +271,7 @@ def _check_unknown(
             f"{where}: unknown {what}; expected {', '.join(known) or 'nothing'} here"
         )
     if child is not None and child.find(".//geometry") is not None:
-        raise InvalidInput(f"{where}: unknown {what}, which holds a <geometry>; rename or remove it")
+        raise InvalidInput(f"{where}: unknown {what}, which holds a <geometry>; remove it")
 
 
 def _checked_numbers(where: str, text: str, expected: _Numbers) -> str:

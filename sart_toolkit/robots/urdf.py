@@ -26,9 +26,10 @@ from typing import Any
 import fast_simplification
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, SartError, unknown_name
-from sart_toolkit.poses import Array, rpy_pose
+from sart_toolkit.poses import Array, inverse, rpy_pose
 from sart_toolkit.robots.enclosure import (
     TOLERANCE,
     Enclosure,
@@ -404,8 +405,8 @@ def _make_light(link: ET.Element, base: Path, work: Path, target: int) -> None:
         out = standing_out(link_parts(link, work), vertices, faces)
         if len(out) and out.max() > TOLERANCE:
             raise InvalidInput(
-                f"link {name!r}: what is drawn stands {out.max() * 1e3:.3f} mm out of its collision "
-                f"parts, expected at most {TOLERANCE * 1e3:g} mm; export its meshes again"
+                f"link {name!r}: what is drawn stands {out.max() * 1e3:.3f} mm out of its "
+                f"collision parts, expected at most {TOLERANCE * 1e3:g} mm; export its meshes again"
             )
 
 
@@ -443,17 +444,21 @@ def drawn_triangles(link: ET.Element, folder: Path) -> tuple[Array, Faces]:
     return np.concatenate(corners), np.concatenate(triangles)
 
 
+def drawn_shapes(link: ET.Element) -> list[Shape]:
+    """The primitives that are drawn of a URDF's link, in its frame."""
+    return [_shape(v) for v in link.findall("visual") if v.find("geometry/mesh") is None]
+
+
 def _enclosed(link: ET.Element, base: Path, vertices: Array, faces: Faces) -> Enclosure:
     """The link's collision parts, grown and joined by others so that all that is drawn is inside.
 
     A primitive that stands out becomes a part itself.
     """
     parts = link_parts(link, base)
-    shapes = [_shape(v) for v in link.findall("visual") if v.find("geometry/mesh") is None]
     if not parts:
         return Enclosure([])
     made = enclose(parts, vertices, faces)
-    for shape in shapes:
+    for shape in drawn_shapes(link):
         if shape_stands_out(made.parts, shape):
             made.parts.append(ShapePart(shape))
     return made
@@ -468,7 +473,7 @@ def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path) -> None:
             mesh = element.find("geometry/mesh")
             if mesh is None:
                 mesh = ET.SubElement(ET.SubElement(element, "geometry"), "mesh")
-            T = np.linalg.inv(_place(element))
+            T = inverse(_place(element))
             hull = trimesh.Trimesh(_moved(part.points, T)).convex_hull
             _export(hull, mesh, work, f"collision_{index}.obj")
         elif index >= len(own):
@@ -489,17 +494,30 @@ def _light(
     Triangles are simplified part by part, `owner (n,)` says which part's they are: none then
     reaches from one part to another, and corners that stand out of a part are moved into it.
     """
-    T_mesh_link = np.linalg.inv(T_link_mesh)
+    T_mesh_link = inverse(T_link_mesh)
     owners = np.unique(owner)
     pieces = []
     for i in owners:
         own = owner == i
-        piece = mesh if len(owners) == 1 else mesh.submesh([np.flatnonzero(own)], append=True)
+        piece = mesh if len(owners) == 1 else _part_of(mesh, own)
         solid = solids.get(_key_of(T_link_mesh)) if len(owners) == 1 else None
         light = _simplified(piece, max(16, round(target * own.mean())), solid)
         corners = parts[i].confined(_moved(light.vertices, T_link_mesh))
         pieces.append(trimesh.Trimesh(_moved(corners, T_mesh_link), light.faces, process=False))
-    return pieces[0] if len(pieces) == 1 else trimesh.util.concatenate(pieces)
+    if len(pieces) == 1:
+        return pieces[0]
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    return trimesh.Trimesh(
+        np.concatenate([piece.vertices for piece in pieces]),
+        np.concatenate([p.faces + start for p, start in zip(pieces, starts, strict=False)]),
+        process=False,
+    )
+
+
+def _part_of(mesh: trimesh.Trimesh, chosen: NDArray[np.bool_]) -> trimesh.Trimesh:
+    """Some triangles of a mesh, without the corners of others."""
+    used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+    return trimesh.Trimesh(mesh.vertices[used], faces.reshape(-1, 3), process=False)
 
 
 def _export(mesh: trimesh.Trimesh, element: ET.Element, work: Path, file: str) -> None:

