@@ -341,7 +341,12 @@ def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
     target = _GRIPPER_FACES if name.startswith(_GRIPPER_PREFIX) else _ARM_FACES
     paths = [_mesh_path(mesh.get("filename", ""), base) for mesh in link.iter("mesh")]
     digests = tuple(_digest(path) if os.path.isfile(path) else "" for path in paths)
-    text, files = _lightened(ET.tostring(link, encoding="unicode"), base, digests, target)
+    key = ET.tostring(link, encoding="unicode"), digests, target
+    if key not in _made_light:
+        if len(_made_light) >= _MOST_LINKS:
+            _made_light.clear()
+        _made_light[key] = _lightened(key[0], base, target)
+    text, files = _made_light[key]
     made = ET.fromstring(text)
     link[:] = list(made)
     # Names that no two links share, and that are safe for any file system.
@@ -354,18 +359,17 @@ def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
         element.append(_material(f"{name}_{index}", colour))
 
 
-@functools.lru_cache(maxsize=128)
-def _lightened(
-    text: str, base: Path, digests: tuple[str, ...], target: int
-) -> tuple[str, dict[str, bytes]]:
-    """A link's element with light meshes, as text, and these meshes' files.
+# Links are remembered by all that they are made from, since robots share them.
+_made_light: dict[tuple[str, tuple[str, ...], int], tuple[str, dict[str, bytes]]] = {}
+_MOST_LINKS = 256
 
-    Remembered, since robots share links.
+
+def _lightened(text: str, base: Path, target: int) -> tuple[str, dict[str, bytes]]:
+    """A link's element with light meshes, as text, and these meshes' files.
 
     Args:
         text: the link's element, checked.
         base: where its meshes' paths start.
-        digests: of its meshes' contents.
         target: about how many faces each visual mesh gets.
     """
     link = ET.fromstring(text)

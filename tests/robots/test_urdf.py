@@ -227,6 +227,22 @@ def test_a_composed_urdf_is_made_once(make_tiny, monkeypatch):
     assert {p: p.stat().st_mtime_ns for p in first.parent.iterdir()} == before
 
 
+def test_links_that_robots_share_are_made_once_in_a_process(make_tiny, tmp_path, monkeypatch):
+    spec = make_tiny()
+    composed_urdf(spec)
+
+    def never(*_):
+        raise AssertionError("made again")
+
+    monkeypatch.setattr(urdf_module, "_make_light", never)
+    path = composed_urdf(spec, (Attachment("peg", "tool", BOX),))
+    assert path.is_file()
+    arm = tmp_path / "arm.urdf"
+    arm.write_text(arm.read_text().replace("0.1 0.1 0.1", "0.1 0.1 0.2", 1))
+    with pytest.raises(AssertionError, match="made again"):
+        composed_urdf(spec)
+
+
 def test_another_robot_source_or_held_body_gets_another_urdf(make_tiny, tmp_path):
     spec = make_tiny()
     made = [
