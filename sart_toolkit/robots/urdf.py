@@ -599,9 +599,15 @@ def _mesh(source: Path, digest: str, scale: tuple[float, ...]) -> trimesh.Trimes
     try:
         # From bytes, so that no other file that it names is read.
         mesh = trimesh.load(
-            io.BytesIO(content), file_type=source.suffix[1:].lower(), force="mesh", process=True
+            io.BytesIO(content), file_type=source.suffix[1:].lower(), force="mesh", process=False
         )
         assert isinstance(mesh, trimesh.Trimesh)
+        # Processing drops corners that aren't finite, and all triangles at them.
+        if mesh.vertices.ndim != 2 or mesh.vertices.shape[1] != 3:
+            raise ValueError("corners without three coordinates")
+        if not np.isfinite(mesh.vertices).all():
+            raise ValueError("NaN or infinite vertices")
+        mesh.process()
         mesh.apply_scale(scale)
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
     except Exception as error:

@@ -245,6 +245,21 @@ def test_a_mesh_that_is_no_mesh_is_broken(make_tiny, tmp_path, suffix):
         composed_urdf(make_tiny())
 
 
+@pytest.mark.parametrize("bad", ["v nan 0 0", "v 0 1e999 0", "v 0 0", "v a b c", ""])
+def test_a_mesh_with_a_corner_that_can_not_be_read_is_broken_and_not_made_without_it(
+    make_tiny, tmp_path, bad
+):
+    (tmp_path / "part.obj").write_text(
+        f"{bad}\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 1 1 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 5\n"
+    )
+    arm = tmp_path / "arm.urdf"
+    arm.write_text(
+        arm.read_text().replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="part.obj"/>')
+    )
+    with pytest.raises(BrokenFile, match="mesh part.obj: can't be read"):
+        composed_urdf(make_tiny())
+
+
 def test_a_link_name_can_not_put_files_elsewhere_or_share_them(make_tiny, tmp_path):
     box = '<mesh filename="part.obj"/>'
     (tmp_path / "part.obj").write_text(
