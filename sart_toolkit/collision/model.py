@@ -61,7 +61,7 @@ class PairDistance:
 class CollisionModel:
     """The convex parts of a robot and of a scene, to be put where their bodies are.
 
-    Robot links are the convex hulls of their collision meshes, which enclose them.
+    Robot links are convex parts that enclose their collision shapes and what is drawn of them.
     """
 
     def __init__(self, robot: RobotSpec, scene: SceneSpec) -> None:

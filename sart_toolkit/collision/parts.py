@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+import xml.etree.ElementTree as ET
+from collections import Counter
 from dataclasses import dataclass
 
 import coal
 import numpy as np
 import pinocchio as pin
 
-from sart_toolkit.errors import InvalidInput
+from sart_toolkit.errors import BrokenFile, InvalidInput
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
@@ -54,14 +56,22 @@ def robot_parts(model: RobotModel) -> list[ConvexPart]:
 
     Raises:
         InvalidInput: a part is neither a mesh nor a box, sphere or cylinder.
+        BrokenFile: the URDF's shapes can't be read, or not all of them were.
     """
     pinocchio_model = model.pinocchio_model
-    loaded = pin.buildGeomFromUrdf(
-        pinocchio_model,
-        str(model.urdf),
-        pin.GeometryType.COLLISION,
-        package_dirs=str(model.urdf.parent),
-    )
+    try:
+        loaded = pin.buildGeomFromUrdf(
+            pinocchio_model,
+            str(model.urdf),
+            pin.GeometryType.COLLISION,
+            package_dirs=str(model.urdf.parent),
+        )
+    except (ValueError, RuntimeError) as error:
+        raise BrokenFile(
+            f"{model.spec.name}: Pinocchio can't read its collision shapes ({error}); check the "
+            "source URDFs"
+        ) from error
+    _check_count(model, loaded)
     parts = []
     for item in loaded.geometryObjects:
         geometry = item.geometry
@@ -73,6 +83,24 @@ def robot_parts(model: RobotModel) -> list[ConvexPart]:
         points = _points(geometry) @ T[:3, :3].T + T[:3, 3]
         parts.append(ConvexPart(frame.name, int(item.parentJoint), geometry, T, points))
     return parts
+
+
+def _check_count(model: RobotModel, loaded: pin.GeometryModel) -> None:
+    """Return if each link has as many shapes as its URDF says; readers drop what they can't read.
+
+    Raises:
+        BrokenFile: a link has more or fewer.
+    """
+    frames = model.pinocchio_model.frames
+    found = Counter(frames[item.parentFrame].name for item in loaded.geometryObjects)
+    for link in ET.parse(model.urdf).getroot().findall("link"):
+        name = link.get("name", "")
+        expected = len(link.findall("collision"))
+        if found[name] != expected:
+            raise BrokenFile(
+                f"{model.spec.name}: link {name!r} has {expected} collision shapes, but "
+                f"{found[name]} were read; check its <collision> elements"
+            )
 
 
 def _points(geometry: coal.CollisionGeometry) -> Array:

@@ -8,7 +8,13 @@ import numpy as np
 import pinocchio as pin
 
 from sart_toolkit.data.records import CameraFrame
-from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable, unknown_name
+from sart_toolkit.errors import (
+    BrokenFile,
+    InvalidInput,
+    MotionRejected,
+    Unreachable,
+    unknown_name,
+)
 from sart_toolkit.poses import Array, check_array, check_pose, frozen
 from sart_toolkit.robots.spec import Attachment, RobotSpec, check_gripper
 from sart_toolkit.robots.urdf import composed_urdf
@@ -42,18 +48,32 @@ class RobotModel:
             gripper: gripper command in [0, 1] at which link poses are computed.
 
         Raises:
-            InvalidInput: gripper command out of range, or joints in another order.
+            InvalidInput: gripper command out of range, joints in another order or without limits,
+                or a source URDF isn't acceptable.
             UnknownName: a joint or frame of `spec` or `held` isn't in the URDF.
+            MissingExtra, MissingFile, BrokenFile: a source URDF or mesh is missing or unreadable.
+            CannotWrite: the composed URDF can't be written.
         """
         self.spec = spec
         self.held = tuple(held)
         self.gripper = check_gripper(gripper)
         self.urdf = composed_urdf(spec, held)
-        full = pin.buildModelFromUrdf(str(self.urdf))
+        try:
+            full = pin.buildModelFromUrdf(str(self.urdf))
+        except (ValueError, RuntimeError) as error:
+            raise BrokenFile(
+                f"{spec.name}: Pinocchio can't read its URDF ({error}); check the source URDFs"
+            ) from error
         linkage = spec.gripper.joint_positions(gripper)
         missing = [n for n in (*spec.arm_joints, *linkage) if not full.existJointName(n)]
         if missing:
             raise unknown_name("joint", missing[0], list(full.names)[1:])
+        for name in (*spec.arm_joints, *linkage):
+            if full.joints[full.getJointId(name)].nq != 1:
+                raise InvalidInput(
+                    f"{spec.name}: joint {name!r} is continuous, expected one with limits; make it "
+                    "revolute in its URDF"
+                )
         reference = pin.neutral(full)
         for name, position in linkage.items():
             reference[full.joints[full.getJointId(name)].idx_q] = position

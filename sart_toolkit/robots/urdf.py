@@ -1,18 +1,23 @@
 """One URDF from an arm, a gripper and what is fixed to them, with light meshes, made once.
 
-Visual meshes are simplified, collision meshes become their convex hulls (which enclose them), and
-names get a prefix, so that any simulator and Pinocchio read the same small file.
+Visual meshes are simplified, collision shapes become convex parts that enclose all of the link,
+what is drawn and what collides, and names get a prefix, so that any simulator and Pinocchio read
+the same small file.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
+import importlib.metadata
+import io
 import json
 import os
 import re
 import shutil
 import tempfile
+import time
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,9 +26,22 @@ from typing import Any
 import fast_simplification
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, SartError, unknown_name
-from sart_toolkit.poses import Array
+from sart_toolkit.poses import Array, inverse, rpy_pose
+from sart_toolkit.robots.enclosure import (
+    TOLERANCE,
+    Enclosure,
+    Faces,
+    HullPart,
+    Part,
+    ShapePart,
+    enclose,
+    shape_stands_out,
+    standing_out,
+)
+from sart_toolkit.robots.source import links_and_joints, parsed, read_bytes
 from sart_toolkit.robots.spec import (
     Attachment,
     RobotSpec,
@@ -33,9 +51,17 @@ from sart_toolkit.robots.spec import (
 )
 
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 11
+_RECIPE = 12
+# What simplifies and hulls: another version may make other meshes.
+_MADE_WITH = ("trimesh", "fast-simplification", "scipy", "numpy")
 _ARM_FACES, _GRIPPER_FACES = 150, 300
 _GRIPPER_PREFIX = "gripper_"
+_MANIFEST = "manifest.json"
+_MESH_TYPES = (".dae", ".glb", ".obj", ".off", ".ply", ".stl")
+_MAX_MESH_BYTES = 100 << 20
+_MAX_EXTENT = 100.0
+# A link given a mass but no inertia has that of a ball of this radius [m].
+_BALL_RADIUS = 0.05
 
 
 def cache_dir() -> Path:
@@ -47,56 +73,129 @@ def cache_dir() -> Path:
 def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
     """The path of the robot's single URDF, with the held bodies fixed on; made once, then cached.
 
+    It is made again when anything it was made from has another content, or its folder has.
+
     Raises:
         MissingExtra, MissingFile: a source URDF isn't there.
-        BrokenFile: a source URDF can't be parsed.
-        InvalidInput: two links or joints have the same name, a link is drawn but has no collision
-            shape, or a collision mesh is empty or not finite.
+        BrokenFile: a source URDF or a mesh can't be parsed, or a mesh is missing.
+        InvalidInput: a number, shape or reference in a source isn't acceptable, two links or
+            joints have the same name, the links aren't one tree, a link is drawn but has no
+            collision shape, or a mesh is empty or not finite.
+        UnknownName: a joint or a body is to be fixed to a frame that isn't there.
+        CannotWrite: the cache can't be written.
     """
     sources = [resource_path(spec.urdf), resource_path(spec.gripper.urdf)]
     attachments = [*spec.attachments, *held]
-    key = hashlib.sha256(
-        json.dumps(
-            {
-                "recipe": _RECIPE,
-                "faces": (_ARM_FACES, _GRIPPER_FACES),
-                "sources": [(str(p), p.stat().st_size, p.stat().st_mtime) for p in sources],
-                # Cameras are no part of a URDF: one that is moved a little needs no new one.
-                "spec": {k: v for k, v in _plain(spec).items() if k != "cameras"},
-                "attachments": _plain(attachments),
-            },
-            sort_keys=True,
-        ).encode()
-    ).hexdigest()[:16]
+    key = _key(spec, attachments, sources)
     directory = cache_dir() / f"{spec.name}-{key}"
     urdf = directory / "robot.urdf"
-    if not urdf.exists():
-        try:
-            _make(spec, attachments, sources, urdf)
-        except SartError:
-            raise
-        except OSError as error:
-            raise CannotWrite(
-                f"{directory}: {error.strerror or error}; set SART_CACHE to a folder that can be "
-                "written"
-            ) from error
+    try:
+        if not _intact(directory):
+            _make(spec, attachments, sources, directory, key)
+    except SartError:
+        raise
+    except OSError as error:
+        raise CannotWrite(
+            f"{directory}: {error.strerror or error}; set SART_CACHE to a folder that can be "
+            "written"
+        ) from error
     return urdf
 
 
+def _key(spec: RobotSpec, attachments: Sequence[Attachment], sources: Sequence[Path]) -> str:
+    """A hash of all that the composed robot is made from: its data and its files' contents."""
+    files = []
+    for source in sources:
+        digest = _digest(source)
+        meshes = {
+            name: _digest(path) if os.path.isfile(path) else None
+            for name in _mesh_names(source, digest)
+            for path in [_mesh_path(name, source.parent)]
+        }
+        files.append([source.name, digest, meshes])
+    made_from = {
+        "recipe": _RECIPE,
+        "faces": (_ARM_FACES, _GRIPPER_FACES),
+        "versions": _versions(),
+        "sources": files,
+        # Cameras are no part of a URDF: one that is moved a little needs no new one.
+        "spec": {k: v for k, v in _plain(spec).items() if k != "cameras"},
+        "attachments": _plain(attachments),
+    }
+    return hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in _MADE_WITH}
+
+
+_digests: dict[tuple[str, int, int, int], str] = {}
+
+
+def _digest(path: Path) -> str:
+    """The SHA-256 of a file's content, remembered in this process while the file is untouched.
+
+    Raises:
+        BrokenFile: it can't be read.
+    """
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise BrokenFile(f"{path.name}: can't be read ({error.strerror}); check it") from error
+    key = str(path), found.st_size, found.st_mtime_ns, found.st_ino
+    if key not in _digests:
+        digest = hashlib.sha256(read_bytes(path, _MAX_MESH_BYTES)).hexdigest()
+        # A file written just now may be written again within the same tick of its clock.
+        if time.time_ns() - found.st_mtime_ns < 2_000_000_000:
+            return digest
+        _digests[key] = digest
+    return _digests[key]
+
+
+@functools.lru_cache(maxsize=64)
+def _mesh_names(source: Path, digest: str) -> tuple[str, ...]:
+    """The mesh files that a URDF of that content names."""
+    return tuple(sorted({mesh.get("filename", "") for mesh in parsed(source).iter("mesh")}))
+
+
+def _intact(directory: Path) -> bool:
+    """Whether a folder holds the files that were put there, with the same content."""
+    try:
+        files = json.loads((directory / _MANIFEST).read_bytes())
+        there = {path.name for path in directory.iterdir()}
+        return there == {*files, _MANIFEST} and all(
+            _digest(directory / name) == digest for name, digest in files.items()
+        )
+    except (OSError, ValueError, TypeError, AttributeError):
+        return False
+
+
 def _make(
-    spec: RobotSpec, attachments: Sequence[Attachment], sources: list[Path], urdf: Path
+    spec: RobotSpec,
+    attachments: Sequence[Attachment],
+    sources: Sequence[Path],
+    directory: Path,
+    key: str,
 ) -> None:
-    """Compose in a temporary folder, then rename it to the URDF's own."""
-    directory = urdf.parent
+    """Compose in a temporary folder, then rename it to the robot's own."""
     directory.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(dir=directory.parent, prefix=f".{spec.name}-"))
     try:
-        _compose(spec, attachments, sources, work)
+        made = work / "made"
+        made.mkdir()
+        _compose(spec, attachments, sources, made)
+        files = {path.name: _digest(path) for path in sorted(made.iterdir())}
+        (made / _MANIFEST).write_text(json.dumps(files, indent=1))
+        if _key(spec, attachments, sources) != key:
+            raise BrokenFile(f"{spec.name}: its files changed while they were read; try again")
         try:
-            os.replace(work, directory)
+            if directory.exists() and not _intact(directory):
+                os.replace(directory, work / "damaged")
+            os.replace(made, directory)
         except OSError:
             # Another process has just put the same files there.
-            if not urdf.exists():
+            if not _intact(directory):
                 raise
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -115,14 +214,14 @@ def _plain(value: Any) -> Any:
 
 
 def _compose(
-    spec: RobotSpec, attachments: Sequence[Attachment], sources: list[Path], work: Path
+    spec: RobotSpec, attachments: Sequence[Attachment], sources: Sequence[Path], work: Path
 ) -> None:
     robot = ET.Element("robot", name=spec.name)
     for source, prefix in zip(sources, ("", _GRIPPER_PREFIX), strict=True):
         for element in _elements(source, prefix):
             robot.append(element)
             if element.tag == "link":
-                _lighten(element, source.parent, work, spec)
+                _lighten(element, source.parent, work, f"{len(robot):03d}", spec)
     for parent, child, T in (
         (spec.gripper.parent_frame, spec.gripper_base, spec.gripper.T_parent_gripper),
         (spec.gripper_base, spec.tool_frame, spec.T_gripper_tool),
@@ -132,7 +231,6 @@ def _compose(
     robot.append(ET.Element("link", name=spec.tool_frame))
     for body in attachments:
         robot.append(rigid_link(body.name, body.shapes, body.mass))
-    _add_armature(robot, spec)
     for kind in ("link", "joint"):
         names = [element.get("name") for element in robot.findall(kind)]
         twice = sorted({str(name) for name in names if names.count(name) > 1})
@@ -142,21 +240,63 @@ def _compose(
     for end in robot.findall("joint/parent") + robot.findall("joint/child"):
         if end.get("link") not in links:
             raise unknown_name("frame", str(end.get("link")), links)
+    _check_tree(spec.name, robot)
     for link in robot.findall("link"):
-        if link.find("inertial") is None:
+        inertial = link.find("inertial")
+        if inertial is None:
             # A simulator would give a link without inertia one kilogram.
             link.append(_inertial(1e-3, np.zeros(3), 1e-6 * np.eye(3)))
-    added = {body.name for body in attachments}
-    for link in robot.findall("link"):
-        # Of what is attached the shapes say themselves which of them collide.
-        drawn = link.find("visual") is not None and link.get("name") not in added
-        if drawn and link.find("collision") is None:
-            raise InvalidInput(
-                f"link {link.get('name')!r}: is drawn but has no collision shape, so nothing can "
-                "be proved about it; give it one in the URDF"
-            )
+        elif inertial.find("inertia") is None:
+            mass = float(_found(inertial, "mass").get("value", ""))
+            moment = 0.4 * max(mass, 1e-3) * _BALL_RADIUS**2
+            inertial.append(_inertia(moment * np.eye(3)))
+    _add_armature(robot, spec)
     ET.indent(robot)
     ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)
+
+
+def _check_tree(name: str, robot: ET.Element) -> None:
+    """Return if the joints make one tree of the links.
+
+    Raises:
+        InvalidInput: a link hangs on two joints or on none, in a loop, or has a joint's name.
+    """
+    parent_of: dict[str, str] = {}
+    for joint in robot.findall("joint"):
+        parent, child = (_found(joint, tag).get("link", "") for tag in ("parent", "child"))
+        if child in parent_of:
+            raise InvalidInput(
+                f"{name}: link {child!r} is the child of two joints, expected one; remove one"
+            )
+        parent_of[child] = parent
+    links = [link.get("name", "") for link in robot.findall("link")]
+    roots = [link for link in links if link not in parent_of]
+    if len(roots) > 1:
+        raise InvalidInput(
+            f"{name}: links {roots[0]!r} and {roots[1]!r} are not joined; join them by a joint"
+        )
+    joined: set[str] = set(roots)
+    for link in links:
+        chain = []
+        while link not in joined and link not in chain:
+            chain.append(link)
+            link = parent_of[link]
+        if link not in joined:
+            raise InvalidInput(f"{name}: joints make a loop through link {link!r}; open it")
+        joined.update(chain)
+    for joint in robot.findall("joint"):
+        # A fixed joint is a frame too, at its child's place.
+        if joint.get("name") in links and joint.get("name") != _found(joint, "child").get("link"):
+            raise InvalidInput(
+                f"{name}: joint {joint.get('name')!r} has the name of a link that isn't its child; "
+                "rename it"
+            )
+
+
+def _found(element: ET.Element, tag: str) -> ET.Element:
+    found = element.find(tag)
+    assert found is not None
+    return found
 
 
 def _add_armature(robot: ET.Element, spec: RobotSpec) -> None:
@@ -164,108 +304,335 @@ def _add_armature(robot: ET.Element, spec: RobotSpec) -> None:
     moving = spec.gripper.joint_positions(0.0)
     links = {link.get("name"): link for link in robot.findall("link")}
     for joint in robot.findall("joint"):
-        child = joint.find("child")
-        if joint.get("name") not in moving or child is None or not spec.gripper.armature:
+        if joint.get("name") not in moving or not spec.gripper.armature:
             continue
-        inertial = links[child.get("link")].find("inertial")
-        assert inertial is not None
+        inertial = _found(links[_found(joint, "child").get("link")], "inertial")
         part, names = (
             ("mass", ["value"])
             if joint.get("type") == "prismatic"
             else ("inertia", ["ixx", "iyy", "izz"])
         )
-        element = inertial.find(part)
-        assert element is not None
+        element = _found(inertial, part)
         for name in names:
             element.set(name, f"{max(float(element.get(name, 0)), spec.gripper.armature):.9g}")
 
 
 def _elements(source: Path, prefix: str) -> list[ET.Element]:
-    """Links and joints of a URDF, names prefixed, vendor extensions left out."""
-    text = source.read_text(errors="replace")
-    # airo-models uses the prefix drake: without declaring it, which no XML parser accepts.
-    text = re.sub(r"<(drake:\w+)\b.*?</\1>", "", text, flags=re.DOTALL)
-    text = re.sub(r"\sdrake:\w+=\"[^\"]*\"", "", text)
-    try:
-        root = ET.fromstring(text)
-    except ET.ParseError as error:
-        raise BrokenFile(f"{source.name}: not a readable URDF ({error}); check the file") from error
-    kept = [element for element in root if element.tag in ("link", "joint")]
+    """Links and joints of a URDF, checked, names prefixed, vendor extensions left out."""
+    kept = links_and_joints(source)
     for element in kept:
         element.set("name", prefix + element.get("name", ""))
         for tag in ("parent", "child"):
             for child in element.findall(tag):
                 child.set("link", prefix + child.get("link", ""))
-        # The robot's GripperSpec describes the linkage; readers treat mimic differently.
-        for mimic in element.findall("mimic"):
-            element.remove(mimic)
     return kept
 
 
-def _lighten(link: ET.Element, base: Path, work: Path, spec: RobotSpec) -> None:
-    """Replace the link's meshes: collisions by their convex hull, visuals by a simplified mesh."""
+def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotSpec) -> None:
+    """Give the link convex parts that enclose it for collisions, and simplified visual meshes.
+
+    Raises:
+        BrokenFile: a mesh is missing or can't be read.
+        InvalidInput: a mesh is empty or not finite, or the link is drawn but doesn't collide.
+    """
     name = link.get("name", "")
     colour = spec.link_colours.get(name, (0.6, 0.6, 0.62, 1.0))
     # The wrist camera sees the gripper close by and the arm never.
     target = _GRIPPER_FACES if name.startswith(_GRIPPER_PREFIX) else _ARM_FACES
+    paths = [_mesh_path(mesh.get("filename", ""), base) for mesh in link.iter("mesh")]
+    digests = tuple(_digest(path) if os.path.isfile(path) else "" for path in paths)
+    key = ET.tostring(link, encoding="unicode"), digests, target
+    if key not in _made_light:
+        if len(_made_light) >= _MOST_LINKS:
+            _made_light.clear()
+        _made_light[key] = _lightened(key[0], base, target)
+    text, files = _made_light[key]
+    made = ET.fromstring(text)
+    link[:] = list(made)
+    # Names that no two links share, and that are safe for any file system.
+    stem = f"{number}_{re.sub(r'[^A-Za-z0-9]+', '_', name)[:40]}"
+    for mesh in link.iter("mesh"):
+        mesh.set("filename", f"{stem}_{mesh.get('filename')}")
+    for file, content in files.items():
+        (work / f"{stem}_{file}").write_bytes(content)
+    for index, element in enumerate(link.findall("visual")):
+        element.append(_material(f"{name}_{index}", colour))
+
+
+# Links are remembered by all that they are made from, since robots share them.
+_made_light: dict[tuple[str, tuple[str, ...], int], tuple[str, dict[str, bytes]]] = {}
+_MOST_LINKS = 256
+
+
+def _lightened(text: str, base: Path, target: int) -> tuple[str, dict[str, bytes]]:
+    """A link's element with light meshes, as text, and these meshes' files.
+
+    Args:
+        text: the link's element, checked.
+        base: where its meshes' paths start.
+        target: about how many faces each visual mesh gets.
+    """
+    link = ET.fromstring(text)
+    with tempfile.TemporaryDirectory(prefix="sart-link-") as folder:
+        _make_light(link, base, Path(folder), target)
+        files = {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
+    return ET.tostring(link, encoding="unicode"), files
+
+
+def _make_light(link: ET.Element, base: Path, work: Path, target: int) -> None:
+    name = link.get("name", "")
+    visuals, collisions = link.findall("visual"), link.findall("collision")
+    if visuals and not collisions:
+        raise InvalidInput(
+            f"link {name!r}: is drawn but has no collision shape, so nothing can be proved about "
+            "it; give it one in the URDF"
+        )
+    for element in [*visuals, *collisions]:
+        mesh = element.find("geometry/mesh")
+        if mesh is not None:
+            _check_mesh(_loaded(mesh, base), name, element.tag, mesh.get("filename", ""))
+    source = drawn_triangles(link, base)
     solids = _collision_meshes(link, base)
-    for kind in ("visual", "collision"):
-        for index, element in enumerate(link.findall(kind)):
-            for material in element.findall("material"):
-                element.remove(material)
-            if kind == "visual":
-                element.append(_material(f"{name}_{index}", colour))
+    made = _enclosed(link, base, *source)
+    _write_parts(link, made.parts, work)
+    start = 0
+    for index, element in enumerate(visuals):
+        mesh = element.find("geometry/mesh")
+        if mesh is None:
+            continue
+        loaded = _loaded(mesh, base)
+        owner = made.owner[start : start + len(loaded.faces)]
+        start += len(loaded.faces)
+        light = _light(loaded, owner, made.parts, _place(element), target, solids)
+        _export(light, mesh, work, f"visual_{index}.obj")
+    for vertices, faces in (source, drawn_triangles(link, work)):
+        out = standing_out(link_parts(link, work), vertices, faces)
+        if len(out) and out.max() > TOLERANCE:
+            raise InvalidInput(
+                f"link {name!r}: what is drawn stands {out.max() * 1e3:.3f} mm out of its "
+                f"collision parts, expected at most {TOLERANCE * 1e3:g} mm; export its meshes again"
+            )
+
+
+def link_parts(link: ET.Element, folder: Path) -> list[Part]:
+    """The convex part of each collision element of a URDF's link, in the link's frame.
+
+    Args:
+        link: the element, its numbers checked.
+        folder: where its meshes' paths start.
+    """
+    parts: list[Part] = []
+    for element in link.findall("collision"):
+        mesh = element.find("geometry/mesh")
+        if mesh is None:
+            parts.append(ShapePart(_shape(element)))
+        else:
+            parts.append(HullPart(_moved(_loaded(mesh, folder).vertices, _place(element))))
+    return parts
+
+
+def drawn_triangles(link: ET.Element, folder: Path) -> tuple[Array, Faces]:
+    """What is drawn of a URDF's link by meshes: corners `(m, 3)` [m] in its frame, and triangles.
+
+    Triangles are `(n, 3)` indices of corners; arguments are those of `link_parts`.
+    """
+    corners, triangles, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.intp)], 0
+    for element in link.findall("visual"):
+        mesh = element.find("geometry/mesh")
+        if mesh is None:
+            continue
+        loaded = _loaded(mesh, folder)
+        corners.append(_moved(loaded.vertices, _place(element)))
+        triangles.append(np.asarray(loaded.faces, np.intp) + count)
+        count += len(loaded.vertices)
+    return np.concatenate(corners), np.concatenate(triangles)
+
+
+def drawn_shapes(link: ET.Element) -> list[Shape]:
+    """The primitives that are drawn of a URDF's link, in its frame."""
+    return [_shape(v) for v in link.findall("visual") if v.find("geometry/mesh") is None]
+
+
+def _enclosed(link: ET.Element, base: Path, vertices: Array, faces: Faces) -> Enclosure:
+    """The link's collision parts, grown and joined by others so that all that is drawn is inside.
+
+    A primitive that stands out becomes a part itself.
+    """
+    parts = link_parts(link, base)
+    if not parts:
+        return Enclosure([])
+    made = enclose(parts, vertices, faces)
+    for shape in drawn_shapes(link):
+        if shape_stands_out(made.parts, shape):
+            made.parts.append(ShapePart(shape))
+    return made
+
+
+def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path) -> None:
+    """Let the link's collision elements be these parts; those added come last."""
+    own = link.findall("collision")
+    for index, part in enumerate(parts):
+        element = own[index] if index < len(own) else ET.SubElement(link, "collision")
+        if isinstance(part, HullPart):
             mesh = element.find("geometry/mesh")
             if mesh is None:
-                continue
-            loaded = _loaded(mesh, base)
-            if kind == "collision":
-                _check_mesh(loaded, name, mesh.get("filename", ""))
-                light = loaded.convex_hull
-            else:
-                light = _simplified(loaded, target, solids.get(_where(element)))
-            file = f"{name}_{kind}_{index}.obj"
-            light.export(work / file, include_normals=False, include_texture=False)
-            mesh.set("filename", file)
-            mesh.attrib.pop("scale", None)
+                mesh = ET.SubElement(ET.SubElement(element, "geometry"), "mesh")
+            T = inverse(_place(element))
+            hull = trimesh.Trimesh(_moved(part.points, T)).convex_hull
+            _export(hull, mesh, work, f"collision_{index}.obj")
+        elif index >= len(own):
+            element.append(_origin(part.shape.T_body_shape))
+            element.append(_geometry(part.shape))
 
 
-def _where(element: ET.Element) -> str:
+def _light(
+    mesh: trimesh.Trimesh,
+    owner: Faces,
+    parts: Sequence[Part],
+    T_link_mesh: Array,
+    target: int,
+    solids: dict[str, trimesh.Trimesh],
+) -> trimesh.Trimesh:
+    """A mesh of about `target` faces that looks like `mesh` and lies in the parts.
+
+    Triangles are simplified part by part, `owner (n,)` says which part's they are: none then
+    reaches from one part to another, and corners that stand out of a part are moved into it.
+    """
+    T_mesh_link = inverse(T_link_mesh)
+    owners = np.unique(owner)
+    pieces = []
+    for i in owners:
+        own = owner == i
+        piece = mesh if len(owners) == 1 else _part_of(mesh, own)
+        solid = solids.get(_key_of(T_link_mesh)) if len(owners) == 1 else None
+        light = _simplified(piece, max(16, round(target * own.mean())), solid)
+        corners = parts[i].confined(_moved(light.vertices, T_link_mesh))
+        pieces.append(trimesh.Trimesh(_moved(corners, T_mesh_link), light.faces, process=False))
+    if len(pieces) == 1:
+        return pieces[0]
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    return trimesh.Trimesh(
+        np.concatenate([piece.vertices for piece in pieces]),
+        np.concatenate([p.faces + start for p, start in zip(pieces, starts, strict=False)]),
+        process=False,
+    )
+
+
+def _part_of(mesh: trimesh.Trimesh, chosen: NDArray[np.bool_]) -> trimesh.Trimesh:
+    """Some triangles of a mesh, without the corners of others."""
+    used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+    return trimesh.Trimesh(mesh.vertices[used], faces.reshape(-1, 3), process=False)
+
+
+def _export(mesh: trimesh.Trimesh, element: ET.Element, work: Path, file: str) -> None:
+    mesh.export(work / file, include_normals=False, include_texture=False, digits=9)
+    element.set("filename", file)
+    element.attrib.pop("scale", None)
+
+
+def _moved(points: Array, T: Array) -> Array:
+    return np.asarray(points, np.float64) @ T[:3, :3].T + T[:3, 3]
+
+
+def _place(element: ET.Element) -> Array:
+    """An element's pose `(4, 4)` in its link."""
     origin = element.find("origin")
-    return "" if origin is None else f"{origin.get('xyz')} {origin.get('rpy')}"
+    given = {} if origin is None else origin.attrib
+    return rpy_pose(*(_floats(given.get(key, "0 0 0")) for key in ("xyz", "rpy")))
+
+
+def _floats(text: str) -> list[float]:
+    return [float(word) for word in text.split()]
+
+
+def _shape(element: ET.Element) -> Shape:
+    """The primitive of a visual or collision element, in the link's frame."""
+    T = _place(element)
+    shape = _found(element, "geometry")[0]
+    if shape.tag == "box":
+        x, y, z = _floats(shape.get("size", ""))
+        return Shape("box", (x, y, z), T)
+    radius = float(shape.get("radius", ""))
+    if shape.tag == "sphere":
+        return Shape("sphere", (radius,), T)
+    return Shape("cylinder", (radius, float(shape.get("length", ""))), T)
+
+
+def _key_of(T: Array) -> str:
+    return str(np.round(T, 9).tolist())
 
 
 def _collision_meshes(link: ET.Element, base: Path) -> dict[str, trimesh.Trimesh]:
     """The link's collision meshes by their place, to draw where a visual mesh stays heavy."""
     return {
-        _where(element): _loaded(mesh, base)
+        _key_of(_place(element)): _loaded(mesh, base)
         for element in link.findall("collision")
         if (mesh := element.find("geometry/mesh")) is not None
     }
 
 
+def _mesh_path(name: str, base: Path) -> Path:
+    return Path(os.path.normpath(base / name))
+
+
 def _loaded(element: ET.Element, base: Path) -> trimesh.Trimesh:
-    source = (base / element.get("filename", "")).resolve()
-    if not source.is_file():
+    """A mesh element's mesh, scaled, in its own frame.
+
+    Raises:
+        BrokenFile: it is missing or can't be read.
+        InvalidInput: its file is of another type than those that are read.
+    """
+    source = _mesh_path(element.get("filename", ""), base)
+    if source.suffix.lower() not in _MESH_TYPES:
+        raise InvalidInput(
+            f"mesh {source.name}: expected a file ending in {', '.join(_MESH_TYPES)}; convert it"
+        )
+    if not os.path.isfile(source):
         raise BrokenFile(f"mesh {source.name} is missing; reinstall the package it comes from")
-    mesh = trimesh.load(source, force="mesh", process=True)
-    assert isinstance(mesh, trimesh.Trimesh)
-    mesh.apply_scale(np.array([float(s) for s in element.get("scale", "1 1 1").split()]))
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    return _mesh(source, _digest(source), tuple(_floats(element.get("scale", "1 1 1"))))
+
+
+@functools.lru_cache(maxsize=16)
+def _mesh(source: Path, digest: str, scale: tuple[float, ...]) -> trimesh.Trimesh:
+    """The mesh of a file of that content, scaled; not to be changed."""
+    content = read_bytes(source, _MAX_MESH_BYTES)
+    try:
+        # From bytes, so that no other file that it names is read.
+        mesh = trimesh.load(
+            io.BytesIO(content), file_type=source.suffix[1:].lower(), force="mesh", process=False
+        )
+        assert isinstance(mesh, trimesh.Trimesh)
+        # Processing drops corners that aren't finite, and all triangles at them.
+        if mesh.vertices.ndim != 2 or mesh.vertices.shape[1] != 3:
+            raise ValueError("corners without three coordinates")
+        if not np.isfinite(mesh.vertices).all():
+            raise ValueError("NaN or infinite vertices")
+        mesh.process()
+        mesh.apply_scale(scale)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    except Exception as error:
+        raise BrokenFile(
+            f"mesh {source.name}: can't be read ({type(error).__name__}: {error}); export it again"
+        ) from error
     return mesh
 
 
-def _check_mesh(mesh: trimesh.Trimesh, link: str, file: str) -> None:
-    """Return if a collision mesh has a convex hull; holes and flat triangles do it no harm.
+def _check_mesh(mesh: trimesh.Trimesh, link: str, kind: str, file: str) -> None:
+    """Return if a mesh can be enclosed; holes and flat triangles do that no harm.
 
     Raises:
-        InvalidInput: it has no faces, or numbers that aren't finite.
+        InvalidInput: it has no faces, numbers that aren't finite, or is far too large.
     """
-    what = f"link {link!r}: collision mesh {Path(file).name}"
+    what = f"link {link!r}: {kind} mesh {Path(file).name}"
     if not len(mesh.faces):
         raise InvalidInput(f"{what} has no triangles; export it again")
     if not np.isfinite(mesh.vertices).all():
         raise InvalidInput(f"{what} has NaN or infinite vertices; export it again")
+    if np.abs(mesh.vertices).max() > _MAX_EXTENT:
+        raise InvalidInput(
+            f"{what} reaches {np.abs(mesh.vertices).max():.4g} m from its origin, expected at most "
+            f"{_MAX_EXTENT:g} m; give it a scale"
+        )
 
 
 def _simplified(
@@ -276,12 +643,23 @@ def _simplified(
     Meshes that fall into many pieces don't simplify well; then the closed `solid` is used, or
     corners closer than a millimetre are joined first.
     """
+    made: list[trimesh.Trimesh] = []
+    for candidate in (lambda: mesh, lambda: solid, lambda: _joined(mesh)):
+        source = candidate()
+        if source is None:
+            continue
+        made.append(_decimated(source, target))
+        if len(made[-1].faces) <= 2 * target:
+            return made[-1]
+    return min(made, key=lambda m: len(m.faces))
+
+
+def _joined(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with corners closer than a millimetre joined."""
     joined = mesh.copy()
     joined.merge_vertices(digits_vertex=3)
     joined.update_faces(joined.nondegenerate_faces())
-    candidates = [_decimated(m, target) for m in (mesh, solid, joined) if m is not None]
-    good = [m for m in candidates if len(m.faces) <= 2 * target]
-    return good[0] if good else min(candidates, key=lambda m: len(m.faces))
+    return joined
 
 
 def _decimated(mesh: trimesh.Trimesh, target: int) -> trimesh.Trimesh:
@@ -319,14 +697,18 @@ def _inertial(mass: float, p: Array, inertia: Array) -> ET.Element:
     inertial = ET.Element("inertial")
     ET.SubElement(inertial, "origin", xyz=_numbers(p), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=f"{mass:.9g}")
+    inertial.append(_inertia(inertia))
+    return inertial
+
+
+def _inertia(inertia: Array) -> ET.Element:
     entries = {
         f"i{a}{b}": f"{inertia[i, j]:.9g}"
         for i, a in enumerate("xyz")
         for j, b in enumerate("xyz")
         if i <= j
     }
-    ET.SubElement(inertial, "inertia", entries)
-    return inertial
+    return ET.Element("inertia", entries)
 
 
 def add_joint(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sart_toolkit.poses import pose
-from sart_toolkit.robots import get_robot
+from sart_toolkit.robots import get_robot, urdf
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import CameraSpec, GripperSpec, RobotSpec
 
@@ -43,6 +43,7 @@ def model(spec: RobotSpec) -> RobotModel:
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Derived files of this test go here; nothing made before is reused."""
     monkeypatch.setenv("SART_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(urdf, "_made_light", {})
     return tmp_path / "cache"
 
 
