@@ -23,6 +23,8 @@ from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec
 
 _PATH_SAMPLES = 1000
+# Sums of margins are to a nanometre what their parts say.
+_DIGITS = 9
 
 
 class SegmentPlanner:
@@ -53,7 +55,7 @@ class SegmentPlanner:
     @property
     def measured_margin(self) -> float:
         """What a measured path has to keep free [m]: `margin`, and what bodies may have moved."""
-        return self._config.margin + BODY_STILLNESS
+        return round(self._config.margin + BODY_STILLNESS, _DIGITS)
 
     def plan(
         self, proposal: Proposal, rng: np.random.Generator, tracking_error: float
@@ -74,7 +76,7 @@ class SegmentPlanner:
                 at t*.
         """
         config, t = self._config, proposal.t_star
-        margin = self.measured_margin + tracking_error
+        margin = round(self.measured_margin + tracking_error, _DIGITS)
         demonstration = self.world.demonstration
         steps, record_hz = demonstration.steps, demonstration.rates.record_hz
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
