@@ -24,6 +24,8 @@ from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec
 
 _PATH_SAMPLES = 1000
+# Sums of margins are to a nanometre what their parts say.
+_DIGITS = 9
 
 
 class SegmentPlanner:
@@ -55,7 +57,7 @@ class SegmentPlanner:
     @property
     def measured_margin(self) -> float:
         """What a measured path has to keep free [m]: `margin`, and what bodies may have moved."""
-        return self._config.margin + BODY_STILLNESS
+        return round(self._config.margin + BODY_STILLNESS, _DIGITS)
 
     def approach(self, t: int) -> Array:
         """The joint targets `(m, n)` [rad], one a physics step, before a segment from waypoint `t`.
@@ -93,7 +95,7 @@ class SegmentPlanner:
                 at t*.
         """
         config, t = self._config, proposal.t_star
-        margin = self.measured_margin + tracking_error
+        margin = round(self.measured_margin + tracking_error, _DIGITS)
         demonstration = self.world.demonstration
         steps, record_hz = demonstration.steps, demonstration.rates.record_hz
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]

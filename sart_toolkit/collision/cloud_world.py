@@ -91,6 +91,7 @@ class CloudWorld(CollisionWorld):
                 {},
                 self.openings(t),
                 slip_tolerance=self.slip_tolerance,
+                gripper_play=self.gripper_play(t),
                 grasped_parts=() if seen.part is None else (seen.part,),
                 cloud=seen.obstacles,
             )

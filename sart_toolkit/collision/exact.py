@@ -84,7 +84,11 @@ class ExactWorld(CollisionWorld):
         if t not in self._placed:
             Ts, _, grasped = self.at(t)
             self._placed[t] = self.collision.placed(
-                Ts, self.openings(t), grasped, slip_tolerance=self.slip_tolerance
+                Ts,
+                self.openings(t),
+                grasped,
+                slip_tolerance=self.slip_tolerance,
+                gripper_play=self.gripper_play(t),
             )
         return self._placed[t]
 

@@ -77,6 +77,10 @@ class Linkage:
             joint = int(self._model.parents[joint])
         return chain if any(self._rates.get(joint) for joint in chain) else []
 
+    def moves(self, part: int) -> bool:
+        """Whether the gripper's opening moves a part."""
+        return bool(self._chains[part])
+
     @functools.lru_cache(maxsize=256)  # noqa: B019 - models live as long as their process
     def _frame_poses(self, gripper: float) -> dict[int, Array]:
         """The poses `(4, 4)` of the frames of parts that the gripper moves, on the arm's joint."""

@@ -121,6 +121,7 @@ class CollisionModel:
         slip_tolerance: float = 0.0,
         grasped_parts: Sequence[ConvexPart] = (),
         cloud: CloudObstacles | None = None,
+        gripper_play: float = 0.0,
     ) -> PlacedModel:
         """The model with the scene's bodies, the gripper and what it grasps put in their places.
 
@@ -134,16 +135,17 @@ class CollisionModel:
                 are given less by that.
             grasped_parts: parts on the last joint that are in the grasp and no bodies of the scene.
             cloud: points that are obstacles too, by the name `CLOUD`.
+            gripper_play: by how much [m] what the gripper moves may stand out of where its opening
+                has it; all distances from it are given less by that.
 
         Raises:
             UnknownName: a body's pose is missing, or a name is of no body or link.
-            InvalidInput: gripper out of range, not a pose, or a negative tolerance.
+            InvalidInput: gripper out of range, not a pose, or a negative tolerance or play.
         """
         grasped = dict(Ts_tool_grasped or {})
-        if not (np.isfinite(slip_tolerance) and slip_tolerance >= 0):
-            raise InvalidInput(
-                f"slip_tolerance: expected a finite number >= 0 m, got {slip_tolerance}"
-            )
+        for what, value in (("slip_tolerance", slip_tolerance), ("gripper_play", gripper_play)):
+            if not (np.isfinite(value) and value >= 0):
+                raise InvalidInput(f"{what}: expected a finite number >= 0 m, got {value}")
         names = [body.name for body in self.scene.bodies]
         for name in grasped:
             if name not in names:
@@ -186,7 +188,9 @@ class CollisionModel:
         ]
         if cloud is not None:
             pairs += [(i, len(parts)) for i in moving]
-        excess = dict(enumerate(sweep.excess)) | dict.fromkeys(in_grasp, slip_tolerance)
+        excess = dict.fromkeys(in_grasp, slip_tolerance)
+        for i, (origin, out) in enumerate(zip(sweep.origins, sweep.excess, strict=True)):
+            excess[i] = out + (gripper_play if self._linkage.moves(origin) else 0.0)
         # Of the second of a pair only the robot's own can stand out; what stands has no excess.
         slip = [excess[i] + excess.get(j, 0.0) for i, j in pairs]
         return PlacedModel(self.kinematics, parts, pairs, self.T_joint_tool, slip, cloud)

@@ -6,7 +6,12 @@ from abc import ABC, abstractmethod
 
 from sart_toolkit.collision.certificate import Certificate, JointPath, certify
 from sart_toolkit.collision.model import PlacedModel
-from sart_toolkit.collision.phases import GRIPPER_TOLERANCE, demonstration_phases
+from sart_toolkit.collision.phases import (
+    GRIPPER_TOLERANCE,
+    HELD_PLAY,
+    HELD_TOLERANCE,
+    demonstration_phases,
+)
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.errors import Mismatch, MotionRejected
 from sart_toolkit.poses import Array
@@ -67,11 +72,17 @@ class CollisionWorld(ABC):
 
         A segment starts with the gripper as it was measured there, and on the way it goes on to
         what is commanded; fingers that hold an object do where it gives way. That range, and
-        `GRIPPER_TOLERANCE` beyond each of its ends, is taken as if it all happened at once.
+        `GRIPPER_TOLERANCE` beyond each of its ends, or `HELD_TOLERANCE` with something in the
+        grasp, is taken as if it all happened at once.
         """
         steps = self.demonstration.steps
         ends = float(steps.measured_gripper[t]), float(steps.commanded_gripper[t])
-        return min(ends) - GRIPPER_TOLERANCE, max(ends) + GRIPPER_TOLERANCE
+        beyond = HELD_TOLERANCE if self.phases[t].grasped else GRIPPER_TOLERANCE
+        return min(ends) - beyond, max(ends) + beyond
+
+    def gripper_play(self, t: int) -> float:
+        """By how much [m] the fingers may stand out of where `openings` has them."""
+        return HELD_PLAY if self.phases[t].grasped else 0.0
 
     def check_known(self, t: int) -> None:
         """Return if all is known that proofs at waypoint `t` are about, and stands still.

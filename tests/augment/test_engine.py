@@ -345,7 +345,7 @@ def test_a_segment_on_which_something_else_is_moved_at_any_time_is_rejected(
 
     def disturbed(*args):
         found = observe(*args)
-        at = pose([far if len(seen) in while_ else 0.0, 0, 0])
+        at = pose([far if len(seen) in while_ else 0.0, 0, 0]) @ found.Ts_world_body["block"]
         seen.append(found)
         return dataclasses.replace(found, Ts_world_body={**found.Ts_world_body, "block": at})
 

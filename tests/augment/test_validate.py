@@ -119,7 +119,7 @@ def stated(**changes):
 def understated(episode):
     """As if the robot had been declared to follow exactly."""
     proof = episode.provenance.certificate
-    commanded = {**proof["commanded"], "margin": AugmentConfig().margin + BODY_STILLNESS}
+    commanded = {**proof["commanded"], "margin": round(AugmentConfig().margin + BODY_STILLNESS, 9)}
     return stated(tracking_error=0.0, commanded=commanded)(episode)
 
 
