@@ -19,7 +19,7 @@ from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, check_counts, recorded
-from sart_toolkit.benchmark.result_log import ResultLog
+from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.collision import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
@@ -217,30 +217,30 @@ def benchmark_segments(
     share, rest = divmod(config.count, len(cells))
     wanted = [(cell.name, i) for n, cell in enumerate(cells) for i in range(share + (n < rest))]
     asked = {"benchmark": "segments", "seed": config.seed, "obstacles": config.obstacles}
-    log = ResultLog(out, asked, overwrite)
-    rows = {(row["cell"], row["attempt"]): row for row in log.rows}
-    missing = [item for item in wanted if item not in rows]
-    done = len(wanted) - len(missing)
-    kept = sum(rows[item]["outcome"] == KEPT for item in wanted if item in rows)
-    with worker_map(functools.partial(_Segments, cells, config), workers) as run:
-        for item, row in zip(missing, run(missing), strict=True):
-            rows[item] = row
-            log.add(row)
-            done += 1
-            kept += row["outcome"] == KEPT
-            if progress is not None:
-                progress(done, len(wanted), kept)
-    table = {
-        cell.name: _segments_summary([rows[item] for item in wanted if item[0] == cell.name])
-        for cell in cells
-    }
-    return log.finish({
-        **about,
-        "config": asdict(config),
-        "total": _segments_totals([rows[item] for item in wanted]),
-        "cells": table,
-        "versions": library_versions(),
-    })  # fmt: skip
+    with ResultLog(out, asked, overwrite) as log:
+        rows = {(row["cell"], row["attempt"]): row for row in log.rows}
+        missing = [item for item in wanted if item not in rows]
+        done = len(wanted) - len(missing)
+        kept = sum(rows[item]["outcome"] == KEPT for item in wanted if item in rows)
+        with worker_map(functools.partial(_Segments, cells, config), workers) as run:
+            for item, row in zip(missing, run(missing), strict=True):
+                rows[item] = row
+                log.add(row)
+                done += 1
+                kept += row["outcome"] == KEPT
+                if progress is not None:
+                    progress(done, len(wanted), kept)
+        table = {
+            cell.name: _segments_summary([rows[item] for item in wanted if item[0] == cell.name])
+            for cell in cells
+        }
+        return log.finish({
+            **about,
+            "config": asdict(config),
+            "total": _segments_totals([rows[item] for item in wanted]),
+            "cells": table,
+            "versions": library_versions(),
+        })  # fmt: skip
 
 
 def _segments_summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

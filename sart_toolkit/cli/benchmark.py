@@ -84,9 +84,9 @@ def replay_verb(args: BenchmarkReplay) -> Result:
 
     with ProgressDisplay() as progress:
         result = benchmark_replay(
-            cells, args.seed, lambda done, wanted: progress("replay", done, wanted)
-        )
-    write_json(args.out, result)
+            cells, args.seed, args.out, args.overwrite,
+            lambda done, wanted: progress("replay", done, wanted),
+        )  # fmt: skip
     return {"benchmark": str(args.out)} | {
         f"{row['task']}: {row['recorded_on']} to {row['replayed_on']}": (
             f"{'success' if row['replayed_success'] else row['reason']}, "
@@ -152,9 +152,9 @@ def cloud_verb(args: BenchmarkCloud) -> Result:
 
     with ProgressDisplay() as progress:
         result = benchmark_clouds(
-            cells, args.seed, lambda done, wanted: progress("cloud", done, wanted)
-        )
-    write_json(args.out, _about() | result)
+            cells, args.seed, args.out, args.overwrite,
+            lambda done, wanted: progress("cloud", done, wanted), _about(),
+        )  # fmt: skip
     return {"benchmark": str(args.out)} | {
         name: f"{row['median_share']:.0%} of the exact radii at the median, at most "
         f"{row['largest_excess_mm']:+.1f} mm larger{_surface_line(row.get('surface_errors'))}"
