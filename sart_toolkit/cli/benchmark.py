@@ -18,7 +18,7 @@ from sart_toolkit.cli.arguments import (
 from sart_toolkit.cli.console import ProgressDisplay, say, typed
 from sart_toolkit.cli.info import plain
 from sart_toolkit.data.records import library_versions
-from sart_toolkit.data.storage import check_writable, read_json, write_json
+from sart_toolkit.data.storage import OutputLock, check_writable, read_json, write_json
 from sart_toolkit.doctor import machine
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks import TASKS, get_task
@@ -178,8 +178,13 @@ def _about() -> Result:
 
 def skill_verb(args: BenchmarkSkill) -> Result:
     """`sart benchmark skill`: one `sart run` after the other, then their figures."""
-    rows: Result = {}
     pairs = _pairs(args.tasks, args.backends)
+    with OutputLock(args.out / "benchmark.json"):
+        return _skills(args, pairs)
+
+
+def _skills(args: BenchmarkSkill, pairs: list[tuple[str, str]]) -> Result:
+    rows: Result = {}
     for task, backend in pairs:
         at = get_task(task).name, get_backend(backend).name
         name, out = "/".join(at), args.out / "-".join(at)

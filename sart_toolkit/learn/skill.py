@@ -279,10 +279,15 @@ def save_skill(
 
     Raises:
         OutputExists: there is a skill already and `overwrite` is false.
-        CannotWrite: the disk refuses.
+        CannotWrite: another process is at work on the directory, or the disk refuses.
     """
     path = Path(path)
-    storage.check_writable(path / "config.json", overwrite)
+    with storage.OutputLock(path, nested=True):
+        storage.check_writable(path / "config.json", overwrite)
+        return _write_skill(path, result, dataset)
+
+
+def _write_skill(path: Path, result: TrainResult, dataset: Dataset) -> SkillConfig:
     storage.remove(path / "config.json")
     source = dataset.sources[0]
     demonstration = source.demonstration

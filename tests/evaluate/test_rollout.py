@@ -163,12 +163,15 @@ def short_task():
 
 
 @pytest.fixture
-def evaluate(monkeypatch, make_peg_backend, tmp_path):
+def evaluate(monkeypatch, make_peg_backend, tmp_path_factory):
     """Evaluates a made-up skill in place of a trained one."""
+    directory = tmp_path_factory.mktemp("skill")
+    for name in ("config.json", "model.safetensors"):
+        (directory / name).write_text(name)
 
     def evaluate(skill, task, config=None, **options):
         monkeypatch.setattr(module, "load_skill", lambda *_, **__: skill)
-        return evaluate_skill(tmp_path, task, make_peg_backend, config, **options)
+        return evaluate_skill(directory, task, make_peg_backend, config, **options)
 
     return evaluate
 
@@ -363,7 +366,7 @@ def test_a_missing_skill_is_refused(peg_task, make_peg_backend, tmp_path):
 
 def test_a_result_that_cannot_be_written_is_an_error(evaluate, short_task, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(CannotWrite, match="nothing was replaced"):
+    with pytest.raises(CannotWrite, match="is not a directory; choose another --out"):
         evaluate(
             Player(),
             short_task,
