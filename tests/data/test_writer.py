@@ -145,8 +145,8 @@ def test_files_that_a_killed_process_was_writing_are_removed(carry_out, tmp_path
 _OTHER = """
 import sys
 from pathlib import Path
-from sart_toolkit.data.storage import Journal
-Journal(Path(sys.argv[1]))
+from sart_toolkit.data.storage import OutputLock
+OutputLock(Path(sys.argv[1]))
 """
 
 
@@ -172,9 +172,8 @@ def test_killed_at_any_moment_it_becomes_the_same(carry_out, tmp_path):
 def test_a_second_process_is_refused_while_the_first_is_at_work(carry_out, source_of, tmp_path):
     path = tmp_path / "d"
     with DatasetWriter(path, [source_of(0)], {"n": N}):
-        manifest = str(path / "manifest.jsonl")
         found = subprocess.run(
-            [sys.executable, "-c", _OTHER, manifest], capture_output=True, text=True
+            [sys.executable, "-c", _OTHER, str(path)], capture_output=True, text=True
         )
         assert "CannotWrite" in found.stderr and "another process is using it" in found.stderr
         for overwrite in (True, False):
