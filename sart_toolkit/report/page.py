@@ -61,6 +61,8 @@ def write_report(run_dir: Path, out: Path) -> None:
     """
     try:
         page = _page(_load_run(Path(run_dir)))
+        # Half a pair of UTF-16, which JSON lets pass, can't be written.
+        page.encode()
     except SartError:
         raise
     # A number, list or name where a JSON file should hold something else.
