@@ -217,7 +217,6 @@ def _alone(stage: Callable[_P, _R]) -> Callable[_P, _R]:
     return alone
 
 
-
 @_alone
 def record(
     task: TaskLike,

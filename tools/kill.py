@@ -44,7 +44,7 @@ main()
 
 @dataclass(frozen=True)
 class Subject:
-    """A command to kill: its words, where `OUT` is what it writes, and a hash of what that holds."""
+    """A command to kill: its words, `OUT` for what it writes, and a hash of what that holds."""
 
     words: str
     out: str

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.benchmark.cells import BLIND, Cell, check_counts, demonstrate
-from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.data.records import library_versions
+from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.errors import SartError
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.robots.model import RobotModel
@@ -119,7 +119,9 @@ def benchmark_operator(
             cell.name: _summary([rows[cell.name, i] for i in range(config.episodes)])
             for cell in cells
         }
-        return log.finish({"config": asdict(config), "cells": table, "versions": library_versions()})
+        return log.finish(
+            {"config": asdict(config), "cells": table, "versions": library_versions()}
+        )
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -15,7 +15,6 @@ import numpy as np
 
 from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
 from sart_toolkit.benchmark.cells import Cell, check_counts, recorded
-from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.collision.parts import coal_transform, convex_distance
@@ -23,6 +22,7 @@ from sart_toolkit.data.records import (
     PrecisionSphere,
     library_versions,
 )
+from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.data.sampling import sample_direction, sample_rotation
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval

@@ -19,7 +19,6 @@ from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, check_counts, recorded
-from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.collision import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
@@ -27,6 +26,7 @@ from sart_toolkit.data.records import (
     Rates,
     library_versions,
 )
+from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.motion.path import nearest_on_polyline

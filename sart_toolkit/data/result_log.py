@@ -12,7 +12,7 @@ from sart_toolkit.errors import Mismatch
 
 
 class ResultLog:
-    """What is done so far of a result, in `NAME.journal` beside it; no other process writes either."""
+    """What is done of a result, in `NAME.journal` beside it; no other process writes either."""
 
     def __init__(self, out: Path, request: Mapping[str, Any], overwrite: bool) -> None:
         """Resume where the same `request` was interrupted, or start.

@@ -272,9 +272,7 @@ def evaluate_skill(
         raise InvalidInput(f"workers: expected at least 1, got {workers}")
     if out is not None:
         check_writable(out, overwrite)
-    make_worker = functools.partial(
-        _Worker, skill_directory, task, make_backend, config, device
-    )
+    make_worker = functools.partial(_Worker, skill_directory, task, make_backend, config, device)
     with contextlib.ExitStack() as stack:
         worker = stack.enter_context(closing(make_worker()))
         log = None

@@ -521,11 +521,11 @@ def _deferred_interrupt() -> Iterator[_DeferredInterrupt]:
     """What Ctrl-C and the signals that ask a process to end are kept in; a second one isn't."""
     interrupt = _DeferredInterrupt()
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            handler = signal.getsignal(number)
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            handler = signal.getsignal(each)
             # Neither what is ignored, nor what ends the process without asking Python.
             if callable(handler):
-                interrupt.handlers[number] = handler
+                interrupt.handlers[each] = handler
     try:
         for number in interrupt.handlers:
             signal.signal(number, interrupt)

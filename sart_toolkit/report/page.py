@@ -67,8 +67,8 @@ def write_report(run_dir: Path, out: Path) -> None:
         raise
     # A number, list or name where a JSON file should hold something else.
     except (
-        ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError,
-        jinja2.TemplateError,
+        ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError,
+        ValueError, jinja2.TemplateError,
     ) as error:  # fmt: skip
         raise BrokenFile(
             f"{run_dir}: one of its JSON files holds a value that can't be shown "

@@ -28,9 +28,7 @@ def test_a_replay_on_another_backend_is_compared_with_what_was_recorded(
         assert np.abs([row["placement"]["x"], row["placement"]["y"]]).max() <= 0.05
 
 
-def test_an_interrupted_replay_keeps_what_was_finished(
-    make_cell, peg_task, tmp_path, monkeypatch
-):
+def test_an_interrupted_replay_keeps_what_was_finished(make_cell, peg_task, tmp_path, monkeypatch):
     cells = [make_cell(peg_task, name) for name in BACKENDS]
     ran = []
 

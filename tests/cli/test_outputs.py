@@ -97,8 +97,6 @@ def test_a_run_is_not_overwritten_while_a_part_of_it_is_written(
     assert (out / "dataset" / "dataset.json").exists() and (out / "run.json").exists()
 
 
-
-
 @pytest.mark.parametrize(
     "command",
     ["suggest demo.h5 --out LINK", "augment demo.h5 annotation.json --n 3 --out LINK"],

@@ -135,7 +135,10 @@ def test_a_row_that_was_cut_short_does_not_count(carry_out, tmp_path):
 
 def test_files_that_a_killed_process_was_writing_are_removed(carry_out, tmp_path):
     carry_out(tmp_path / "d", 3)
-    left = [tmp_path / "d/.dataset.x1y_z2w3.json", tmp_path / "d/episodes/demo00/.sphere00_k00009.x1y_z2w3.h5"]
+    left = [
+        tmp_path / "d/.dataset.x1y_z2w3.json",
+        tmp_path / "d/episodes/demo00/.sphere00_k00009.x1y_z2w3.h5",
+    ]
     for path in left:
         path.write_text("half")
     carry_out(tmp_path / "d")

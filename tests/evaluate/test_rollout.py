@@ -329,16 +329,12 @@ def test_two_evaluations_of_one_result_at_once_are_refused(evaluate, short_task,
             with pytest.raises(CannotWrite, match="another process is using it"):
                 evaluate(Player(), short_task, out=tmp_path / "e.json", overwrite=overwrite)
 
-    evaluate(
-        Player(), short_task, EvaluateConfig(2), out=tmp_path / "e.json", progress=meanwhile
-    )
+    evaluate(Player(), short_task, EvaluateConfig(2), out=tmp_path / "e.json", progress=meanwhile)
     assert read_json(tmp_path / "e.json")["n_episodes"] == 2
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_a_policy_acts_with_one_thread_also_for_its_videos(
-    evaluate, short_task, tmp_path, threads
-):
+def test_a_policy_acts_with_one_thread_also_for_its_videos(evaluate, short_task, tmp_path, threads):
     seen = []
 
     class Counting(Player):

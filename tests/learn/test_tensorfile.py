@@ -1,5 +1,4 @@
 import json
-
 import resource
 
 import pytest
