@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import resource
 import signal
 import threading
 
@@ -452,6 +453,24 @@ def test_a_disk_that_refuses_is_reported_before_training(dataset, small_config, 
             progress=lambda *args: steps.append(args),
         )
     assert not steps
+
+
+def test_a_disk_that_fills_up_leaves_the_last_checkpoint_to_resume_from(
+    dataset, small_config, tmp_path
+):
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, small_config, tmp_path / "cut", progress=_press_ctrl_c_after(6))
+    before = (tmp_path / "cut" / CHECKPOINT).read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, hard))
+    try:
+        with pytest.raises(CannotWrite, match="nothing was replaced, make room or choose another"):
+            train(dataset, small_config, tmp_path / "cut")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (tmp_path / "cut" / CHECKPOINT).read_bytes() == before
+    whole = train(dataset, small_config, tmp_path / "whole")
+    assert _same_weights(whole, train(dataset, small_config, tmp_path / "cut"))
 
 
 def test_training_starts_from_backbone_weights(dataset, tmp_path):
