@@ -30,7 +30,6 @@ from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.learn.skill import Skill, load_skill
-from sart_toolkit.learn.training import torch_threads
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.appearance import randomise_appearance
@@ -38,9 +37,6 @@ from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.workers import worker_map
 
 _OVERVIEW, _VIDEO_SIZE = "overview", 384
-# For a batch of one, more only wait for each other: measured on two cores, two took 3 (compact_mlp)
-# to 6 times (resnet18_mlp) as long, and with a core taken by something else 8 to 13 times.
-_THREADS = 1
 _log = logging.getLogger(__name__)
 
 
@@ -203,12 +199,6 @@ class _Worker:
     def __call__(
         self, episode: int, watch: Callable[[Observation, int, bool], None] | None = None
     ) -> Rollout:
-        with torch_threads(_THREADS):
-            return self._rollout(episode, watch)
-
-    def _rollout(
-        self, episode: int, watch: Callable[[Observation, int, bool], None] | None
-    ) -> Rollout:
         seed = self.config.eval_seed
         placement = episode_placement(self.task, seed, episode, self.config.yaw_deg)
         if self.config.vary_appearance:
@@ -239,9 +229,9 @@ def evaluate_skill(
 ) -> dict[str, Any]:
     """Evaluate a skill on random placements; the result as in `evaluation.json`.
 
-    The policy computes with one thread, in this process and in others, so that neither the number
-    of processes nor running a rollout again for a video changes what it does. With `out`, finished
-    rollouts are kept beside it until all are done: interrupted, it resumes there.
+    Neither the number of processes nor running a rollout again for a video changes what the policy
+    does: it computes with one thread everywhere. With `out`, finished rollouts are kept beside it
+    until all are done: interrupted, it resumes there.
 
     Args:
         skill_directory: the trained skill.

@@ -333,27 +333,6 @@ def test_two_evaluations_of_one_result_at_once_are_refused(evaluate, short_task,
     assert read_json(tmp_path / "e.json")["n_episodes"] == 2
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_a_policy_acts_with_one_thread_also_for_its_videos(evaluate, short_task, tmp_path, threads):
-    seen = []
-
-    class Counting(Player):
-        def act(self, images, gripper):
-            seen.append(torch.get_num_threads())
-            return super().act(images, gripper)
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        config = EvaluateConfig(episodes=1, videos=1)
-        out = tmp_path / "e.json"
-        evaluate(Counting(), short_task, config, out=out, film=lambda *_: None)
-        assert torch.get_num_threads() == threads
-    finally:
-        torch.set_num_threads(before)
-    assert seen == [1] * 12
-
-
 def test_without_a_camera_outside_there_are_no_videos_and_that_is_said(
     evaluate, short_task, tmp_path, monkeypatch, caplog
 ):
