@@ -314,11 +314,16 @@ class Journal:
 
         Raises:
             CannotWrite: the disk refuses.
+            InvalidInput: a number is NaN or infinite, or a value isn't JSON.
         """
+        try:
+            line = json.dumps(row, allow_nan=False).encode() + b"\n"
+        except (TypeError, ValueError) as error:
+            raise InvalidInput(f"{self.path}: can't be written as JSON: {error}") from error
         with _cannot_write(self.path):
             end = self._file.seek(0, os.SEEK_END)
             try:
-                self._file.write(json.dumps(row, allow_nan=False).encode() + b"\n")
+                self._file.write(line)
                 self._file.flush()
                 os.fsync(self._file.fileno())
             except OSError:

@@ -21,7 +21,7 @@ from sart_toolkit.data.storage import (
     write_json,
     write_text,
 )
-from sart_toolkit.errors import CannotWrite, Mismatch, OutputExists
+from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, OutputExists
 
 _HOLDER = """
 import sys
@@ -220,6 +220,15 @@ def test_a_result_log_resumes_what_was_asked_for_and_nothing_else(tmp_path):
         ResultLog(out, {"seed": 0}, overwrite=False)
     with ResultLog(out, {"seed": 1}, overwrite=True) as log:
         assert log.rows == [] and out.exists()
+
+
+@pytest.mark.parametrize("value", [float("nan"), object()])
+def test_a_row_that_json_can_not_hold_is_refused_and_leaves_nothing(tmp_path, value):
+    with ResultLog(tmp_path / "out.json", {}, overwrite=False) as log:
+        with pytest.raises(InvalidInput, match="out.json.journal: can't be written as JSON"):
+            log.add({"n": value})
+        log.add({"n": 1})
+        assert log.rows == [{"n": 1}]
 
 
 def test_only_what_a_killed_writer_left_is_removed(tmp_path):
