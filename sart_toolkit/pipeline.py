@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 import logging
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from sart_toolkit.data.records import (
     library_versions,
 )
 from sart_toolkit.data.storage import (
+    OutputLock,
     check_writable,
     clear_directory,
     load_annotation,
@@ -41,7 +43,7 @@ from sart_toolkit.data.storage import (
     write_json,
 )
 from sart_toolkit.doctor import machine
-from sart_toolkit.errors import InvalidInput, Mismatch, MissingFile, UnknownName
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, UnknownName
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.record.devices import DEVICES, make_device
 from sart_toolkit.registry import check_known, reference_to
@@ -199,7 +201,23 @@ def _checked_size(image_size: ImageSize) -> tuple[int, int]:
 
 # --- the stages ---------------------------------------------------------------------------------
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
+
+def _alone(stage: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The stage, holding the lock of its output `out` from its first check to its last write."""
+    signature = inspect.signature(stage)
+
+    @functools.wraps(stage)
+    def alone(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with OutputLock(signature.bind(*args, **kwargs).arguments["out"]):
+            return stage(*args, **kwargs)
+
+    return alone
+
+
+@_alone
 def record(
     task: TaskLike,
     out: Path,
@@ -318,6 +336,7 @@ def world_of(
     return make_world(source, demonstration, spec, scene, slip_tolerance, cloud)
 
 
+@_alone
 def suggest(
     demo: Path,
     out: Path,
@@ -442,6 +461,7 @@ def validate(
     )  # fmt: skip
 
 
+@_alone
 def train_policy(
     dataset: Path,
     out: Path,
@@ -457,7 +477,7 @@ def train_policy(
         dataset: directory from `augment`.
         out: directory to write; an interrupted training resumes.
         policy: what is trained.
-        overwrite: whether a skill in `out` may be replaced.
+        overwrite: whether a skill in `out` may be replaced, or an interrupted training forgotten.
         progress: called with the steps done.
         options: of `TrainConfig`; the policy's own where left out or None.
 
@@ -477,7 +497,7 @@ def train_policy(
         clear_directory(out, "config.json", overwrite=True)
     result = train(
         generated, config, out, lambda done, total, text: progress("train", done, total, text),
-        reading=lambda done, total: progress("read", done, total),
+        resume=not overwrite, reading=lambda done, total: progress("read", done, total),
     )  # fmt: skip
     save_skill(out, result, generated)
     return config
@@ -507,7 +527,7 @@ def evaluate(
 
     Args:
         skill: the skill.
-        out: JSON file to write; videos go beside it.
+        out: JSON file to write; videos go beside it. An interrupted evaluation resumes.
         task, robot, backend: in place of those that the skill notes.
         workers: processes.
         device: where the policy runs.
@@ -519,6 +539,7 @@ def evaluate(
         MissingFile, BrokenFile: the skill can't be read.
         UnknownName: task, robot or backend can't be found.
         InvalidInput: `workers` is not positive.
+        Mismatch: another evaluation into `out` was interrupted.
         OutputExists, CannotWrite: `out` can't be written.
     """
     check_names(task=task, robot=robot, backend=backend)
@@ -542,8 +563,9 @@ def evaluate(
         progress("evaluate", done, wanted, f"{successes}/{done} succeeded")
 
     return evaluate_skill(
-        skill, task_of(about, task), make, config, out, workers, device, report_progress, film
-    )
+        skill, task_of(about, task), make, config, out, workers, device, report_progress, film,
+        overwrite,
+    )  # fmt: skip
 
 
 def report(run_dir: Path, out: Path | None = None, *, overwrite: bool = False) -> Path:
@@ -557,18 +579,20 @@ def report(run_dir: Path, out: Path | None = None, *, overwrite: bool = False) -
     """
     if not run_dir.is_dir():
         raise MissingFile(f"{run_dir}: no such directory; pass one that `sart run` wrote")
-    if out is not None:
-        check_writable(out, overwrite)
-    from sart_toolkit.report.page import write_report
-
     page = out or run_dir / "report.html"
-    write_report(run_dir, page)
+    with OutputLock(page):
+        if out is not None:
+            check_writable(out, overwrite)
+        from sart_toolkit.report.page import write_report
+
+        write_report(run_dir, page)
     return page
 
 
 # --- all of them --------------------------------------------------------------------------------
 
 
+@_alone
 def run(
     task: TaskLike,
     out: Path | str,
@@ -699,19 +723,35 @@ def run(
             write_json(out / "run.json", state)
         _log.info("%-9s %6.1f s  %s", name, seconds, result)
     page = report(out)
-    figures, generated = read_json(evaluation), read_json(dataset / "dataset.json")
+    successes, of, rate, ci95 = _read_fields(
+        evaluation, "n_success", "n_episodes", "success_rate", "ci95"
+    )
+    kept, attempted = _read_fields(dataset / "dataset.json", "n_kept", "n_attempted")
     return {
         "task": found.name,
-        "success": f"{figures['n_success']}/{figures['n_episodes']}",
-        "success_rate": figures["success_rate"],
-        "ci95": figures["ci95"],
-        "kept": generated["n_kept"],
-        "attempted": generated["n_attempted"],
+        "success": f"{successes}/{of}",
+        "success_rate": rate,
+        "ci95": ci95,
+        "kept": kept,
+        "attempted": attempted,
         "stages_seconds": {k: round(v, 1) for k, v in state["stages"].items()},
         "seconds": round(sum(state["stages"].values()), 1),
         "skill": str(skill),
         "report": str(page),
     }
+
+
+def _read_fields(path: Path, *names: str) -> list[Any]:
+    """What a JSON file has under names.
+
+    Raises:
+        MissingFile, BrokenFile: the file can't be read, or has no such name.
+    """
+    value = read_json(path)
+    for name in names:
+        if name not in value:
+            raise BrokenFile(f"{path}: has no {name}; remove it to have it made again")
+    return [value[name] for name in names]
 
 
 def _named(kind: str, given: Any, found: Any) -> str:
@@ -725,14 +765,21 @@ def _resumed(out: Path, wanted: Mapping[str, Any], overwrite: bool) -> dict[str,
     if overwrite:
         clear_directory(out, "run.json", overwrite=True)
     elif (out / "run.json").exists():
-        state = read_json(out / "run.json")
-        if state["config"] != wanted:
-            changed = [k for k, v in wanted.items() if state["config"].get(k) != v]
+        config, stages = _read_fields(out / "run.json", "config", "stages")
+        if not isinstance(config, dict) or not isinstance(stages, dict) or not all(
+            isinstance(seconds, int | float) for seconds in stages.values()
+        ):  # fmt: skip
+            raise BrokenFile(
+                f"{out / 'run.json'}: expected settings in config and the seconds of each stage "
+                "in stages; add --overwrite or choose another --out"
+            )
+        if config != wanted:
+            changed = [k for k, v in wanted.items() if config.get(k) != v]
             raise Mismatch(
                 f"{out}: holds a run with another {', '.join(changed)}; add --overwrite or choose "
                 "another --out"
             )
-        return state
+        return {"config": config, "stages": stages}
     else:
         check_writable(out)
     return {"config": wanted, "stages": {}}

@@ -11,8 +11,8 @@ import pytest
 import sart_toolkit as sart
 from sart_toolkit import pipeline
 from sart_toolkit.cli import main
-from sart_toolkit.data.storage import load_demonstration, read_json
-from sart_toolkit.errors import InvalidInput, Mismatch, MissingFile, UnknownName
+from sart_toolkit.data.storage import load_demonstration, read_json, write_json
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, UnknownName
 
 MINE = """
 import dataclasses
@@ -186,6 +186,31 @@ def test_a_whole_run_takes_objects_and_resumes(there, tmp_path, caplog):
     assert sum("done before" in record.message for record in caplog.records) == 4
     with pytest.raises(Mismatch, match="holds a run with another n;"):
         sart.run("my_things.py:Drawer", tmp_path / "run", **given | {"n": 4})
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        {},
+        {"config": {}},
+        {"config": [], "stages": {}},
+        {"config": {}, "stages": {"record": "long"}},
+        {"config": {}, "stages": [1.0]},
+    ],
+)
+def test_a_run_whose_state_makes_no_sense_is_refused(tmp_path, state):
+    write_json(tmp_path / "run.json", state)
+    before = (tmp_path / "run.json").read_bytes()
+    with pytest.raises(BrokenFile, match=r"run.json: (has no|expected)"):
+        sart.run("peg_in_hole", tmp_path)
+    assert (tmp_path / "run.json").read_bytes() == before
+
+
+def test_a_result_that_lacks_a_figure_is_named(tmp_path):
+    write_json(tmp_path / "e.json", {"n_success": 3})
+    assert pipeline._read_fields(tmp_path / "e.json", "n_success") == [3]
+    with pytest.raises(BrokenFile, match=r"e.json: has no ci95; remove it to have it made again"):
+        pipeline._read_fields(tmp_path / "e.json", "n_success", "ci95")
 
 
 def test_what_cannot_work_is_said_before_anything_is_written(there, tmp_path):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.parts import ConvexPart
 from sart_toolkit.data.records import library_versions
+from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.poses import Array
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
@@ -26,38 +29,61 @@ from sart_toolkit.tasks.task import Placement
 
 # Where the two are compared, small radii count too.
 _LEAST_RADIUS = 0.0005
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 def benchmark_clouds(
-    cells: Sequence[Cell], seed: int = 0, progress: Callable[[int, int], None] | None = None
+    cells: Sequence[Cell],
+    seed: int,
+    out: Path,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    about: Mapping[str, Any] = _NOTHING,
 ) -> dict[str, Any]:
     """For each cell, the radii of all suggested spheres from the scene and from the cloud.
 
     Spheres are where the exact suggestion has them. Also the seconds that either suggestion takes,
     the cloud's fusion included, models of robot and scene built before; and how far the cloud's
     seen points are from the true surfaces until the first contact, and how many of them lie in
-    the robot's moving parts, or what it holds, at any waypoint until then.
+    the robot's moving parts, or what it holds, at any waypoint until then. Finished cells are kept
+    beside `out` until all are done: interrupted, it resumes there.
 
     Args:
         cells: tasks and backends; the backends draw images.
         seed: of the scripted operator.
+        out: JSON file to write.
+        overwrite: replace `out`, and forget finished cells.
         progress: called with (cells done, cells in all).
+        about: what else is to stand in the file, such as the command.
+
+    Raises:
+        OutputExists: `out` is there and `overwrite` is false.
+        Mismatch: it was interrupted with another seed.
+        CannotWrite: the disk refuses.
     """
-    rows = {}
-    for done, cell in enumerate(cells, 1):
-        rows[cell.name] = _compared(cell, seed)
-        if progress is not None:
-            progress(done, len(cells))
-    spheres = [sphere for row in rows.values() for sphere in row["spheres"]]
-    return {
-        "total": {
-            "n_spheres": len(spheres),
-            "median_share": float(np.median([s["cloud"] / s["exact"] for s in spheres])),
-            "largest_excess_mm": max(1e3 * (s["cloud"] - s["exact"]) for s in spheres),
-        },
-        "cells": rows,
-        "versions": library_versions(),
-    }
+    with ResultLog(out, {"benchmark": "cloud", "seed": seed}, overwrite) as log:
+        found = {row["cell"]: row["compared"] for row in log.rows}
+        done = sum(cell.name in found for cell in cells)
+        for cell in cells:
+            if cell.name in found:
+                continue
+            found[cell.name] = _compared(cell, seed)
+            log.add({"cell": cell.name, "compared": found[cell.name]})
+            done += 1
+            if progress is not None:
+                progress(done, len(cells))
+        rows = {cell.name: found[cell.name] for cell in cells}
+        spheres = [sphere for row in rows.values() for sphere in row["spheres"]]
+        return log.finish({
+            **about,
+            "total": {
+                "n_spheres": len(spheres),
+                "median_share": float(np.median([s["cloud"] / s["exact"] for s in spheres])),
+                "largest_excess_mm": max(1e3 * (s["cloud"] - s["exact"]) for s in spheres),
+            },
+            "cells": rows,
+            "versions": library_versions(),
+        })  # fmt: skip
 
 
 def _on_robot(points: Array, world: ExactWorld, waypoints: Sequence[int]) -> int:

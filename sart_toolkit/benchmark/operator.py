@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit.benchmark.cells import BLIND, Cell, check_counts, demonstrate
-from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.data.records import library_versions
+from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.errors import SartError
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.robots.model import RobotModel
@@ -101,24 +101,27 @@ def benchmark_operator(
     """
     for cell in cells:
         cell.task.sample_placement(np.random.default_rng(config.seed), config.yaw_deg)
-    log = ResultLog(out, {"seed": config.seed, "yaw_deg": config.yaw_deg}, overwrite)
-    rows = {(row["cell"], row["episode"]): row for row in log.rows}
-    wanted = [(cell.name, i) for cell in cells for i in range(config.episodes)]
-    missing = [item for item in wanted if item not in rows]
-    done = len(wanted) - len(missing)
-    successes = sum(rows[item]["success"] for item in wanted if item in rows)
-    with worker_map(functools.partial(_Operator, cells, config), workers) as run:
-        for item, row in zip(missing, run(missing), strict=True):
-            rows[item] = row
-            log.add(row)
-            done += 1
-            successes += row["success"]
-            if progress is not None:
-                progress(done, len(wanted), successes)
-    table = {
-        cell.name: _summary([rows[cell.name, i] for i in range(config.episodes)]) for cell in cells
-    }
-    return log.finish({"config": asdict(config), "cells": table, "versions": library_versions()})
+    with ResultLog(out, {"seed": config.seed, "yaw_deg": config.yaw_deg}, overwrite) as log:
+        rows = {(row["cell"], row["episode"]): row for row in log.rows}
+        wanted = [(cell.name, i) for cell in cells for i in range(config.episodes)]
+        missing = [item for item in wanted if item not in rows]
+        done = len(wanted) - len(missing)
+        successes = sum(rows[item]["success"] for item in wanted if item in rows)
+        with worker_map(functools.partial(_Operator, cells, config), workers) as run:
+            for item, row in zip(missing, run(missing), strict=True):
+                rows[item] = row
+                log.add(row)
+                done += 1
+                successes += row["success"]
+                if progress is not None:
+                    progress(done, len(wanted), successes)
+        table = {
+            cell.name: _summary([rows[cell.name, i] for i in range(config.episodes)])
+            for cell in cells
+        }
+        return log.finish(
+            {"config": asdict(config), "cells": table, "versions": library_versions()}
+        )
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -15,7 +15,6 @@ import numpy as np
 
 from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
 from sart_toolkit.benchmark.cells import Cell, check_counts, recorded
-from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.collision.parts import coal_transform, convex_distance
@@ -23,6 +22,7 @@ from sart_toolkit.data.records import (
     PrecisionSphere,
     library_versions,
 )
+from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.data.sampling import sample_direction, sample_rotation
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
@@ -384,30 +384,30 @@ def benchmark_radii(
         Mismatch: it was interrupted with other numbers, or a demonstration failed.
         CannotWrite: the disk refuses.
     """
-    log = ResultLog(out, {"benchmark": "radii", **asdict(config)}, overwrite)
-    rows = {row["cell"]: row for row in log.rows}
-    missing = [cell.name for cell in cells if cell.name not in rows]
-    done = len(cells) - len(missing)
-    work = functools.partial(_Radii, cells, make_checker, config)
-    with worker_map(work, workers) as run:
-        for name, row in zip(missing, run(missing), strict=True):
-            rows[name] = row
-            log.add(row)
-            done += 1
-            if progress is not None:
-                progress(done, len(cells))
-    table = {}
-    for cell in cells:
-        row = {key: value for key, value in rows[cell.name].items() if key != "cell"}
-        table[cell.name] = _radii_totals(row["spheres"]) | row
-    every = [sphere for row in table.values() for sphere in row["spheres"]]
-    return log.finish({
-        **about,
-        "config": asdict(config),
-        "total": _radii_totals(every),
-        "cells": table,
-        "versions": library_versions(),
-    })  # fmt: skip
+    with ResultLog(out, {"benchmark": "radii", **asdict(config)}, overwrite) as log:
+        rows = {row["cell"]: row for row in log.rows}
+        missing = [cell.name for cell in cells if cell.name not in rows]
+        done = len(cells) - len(missing)
+        work = functools.partial(_Radii, cells, make_checker, config)
+        with worker_map(work, workers) as run:
+            for name, row in zip(missing, run(missing), strict=True):
+                rows[name] = row
+                log.add(row)
+                done += 1
+                if progress is not None:
+                    progress(done, len(cells))
+        table = {}
+        for cell in cells:
+            row = {key: value for key, value in rows[cell.name].items() if key != "cell"}
+            table[cell.name] = _radii_totals(row["spheres"]) | row
+        every = [sphere for row in table.values() for sphere in row["spheres"]]
+        return log.finish({
+            **about,
+            "config": asdict(config),
+            "total": _radii_totals(every),
+            "cells": table,
+            "versions": library_versions(),
+        })  # fmt: skip
 
 
 def _radii_totals(spheres: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -20,13 +20,13 @@ from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import Backend
 from sart_toolkit.benchmark.cells import WITHOUT_IMAGES, Cell, recorded
 from sart_toolkit.benchmark.limits import SentTargets
-from sart_toolkit.benchmark.result_log import ResultLog
 from sart_toolkit.collision import Source
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import (
     Annotation,
     library_versions,
 )
+from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.record.session import SessionConfig
@@ -173,30 +173,30 @@ def benchmark_segments(
     share, rest = divmod(config.count, len(named))
     wanted = [(name, i) for n, name in enumerate(named) for i in range(share + (n < rest))]
     asked = {"benchmark": "segments", "seeds": list(config.seeds), "obstacles": config.obstacles}
-    log = ResultLog(out, asked, overwrite)
-    rows = {(row["cell"], row["attempt"]): row for row in log.rows}
-    missing = [item for item in wanted if item not in rows]
-    done = len(wanted) - len(missing)
-    kept = sum(rows[item]["outcome"] == KEPT for item in wanted if item in rows)
-    with worker_map(functools.partial(_Segments, named, config), workers) as run:
-        for item, row in zip(missing, run(missing), strict=True):
-            rows[item] = row
-            log.add(row)
-            done += 1
-            kept += row["outcome"] == KEPT
-            if progress is not None:
-                progress(done, len(wanted), kept)
-    table = {
-        name: _segments_summary([rows[item] for item in wanted if item[0] == name])
-        for name in named
-    }
-    return log.finish({
-        **about,
-        "config": asdict(config),
-        "total": _segments_totals([rows[item] for item in wanted]),
-        "cells": table,
-        "versions": library_versions(),
-    })  # fmt: skip
+    with ResultLog(out, asked, overwrite) as log:
+        rows = {(row["cell"], row["attempt"]): row for row in log.rows}
+        missing = [item for item in wanted if item not in rows]
+        done = len(wanted) - len(missing)
+        kept = sum(rows[item]["outcome"] == KEPT for item in wanted if item in rows)
+        with worker_map(functools.partial(_Segments, named, config), workers) as run:
+            for item, row in zip(missing, run(missing), strict=True):
+                rows[item] = row
+                log.add(row)
+                done += 1
+                kept += row["outcome"] == KEPT
+                if progress is not None:
+                    progress(done, len(wanted), kept)
+        table = {
+            name: _segments_summary([rows[item] for item in wanted if item[0] == name])
+            for name in named
+        }
+        return log.finish({
+            **about,
+            "config": asdict(config),
+            "total": _segments_totals([rows[item] for item in wanted]),
+            "cells": table,
+            "versions": library_versions(),
+        })  # fmt: skip
 
 
 def _segments_summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

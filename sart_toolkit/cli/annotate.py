@@ -17,6 +17,7 @@ from sart_toolkit.cli.suggest import describe_spheres
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.storage import (
     Journal,
+    OutputLock,
     check_writable,
     load_annotation,
     load_demonstration,
@@ -40,6 +41,12 @@ def annotate_verb(args: Annotate) -> dict[str, Any]:
     headless = args.no_window and not args.text
     if headless and not args.suggest_all:
         raise InvalidInput("--no-window: leaves nothing to do; add --suggest-all, or --text")
+    out = args.out or args.demo.with_name(f"{args.demo.stem}.annotation.json")
+    with OutputLock(out) as lock:
+        return _annotate(args, out, headless, lock)
+
+
+def _annotate(args: Annotate, out: Path, headless: bool, lock: OutputLock) -> dict[str, Any]:
     with _window_probe(wanted=not (args.text or args.no_window)) as probe:
         demonstration = pipeline.noted(load_demonstration(args.demo), args.task, args.robot)
         # Not before the demonstration is read: these imports take a second.
@@ -51,7 +58,6 @@ def annotate_verb(args: Annotate) -> dict[str, Any]:
                 margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius
             )
         )
-        out = args.out or args.demo.with_name(f"{args.demo.stem}.annotation.json")
         journal_path = out.with_name(f"{out.name}.journal")
         if headless and journal_path.exists() and not args.overwrite:
             raise OutputExists(
@@ -67,7 +73,7 @@ def annotate_verb(args: Annotate) -> dict[str, Any]:
         )
         if probe is not None and not (finding := probe.result()).ok:
             raise MissingCapability(f"no window: {finding.detail}; {finding.remedy}; {_WITHOUT}")
-    journal = Journal(journal_path)
+    journal = Journal(journal_path, lock)
     if args.overwrite:
         journal.clear()
     session = AnnotationSession(demonstration, world, config, annotation, out, journal)

@@ -409,6 +409,8 @@ class Evaluate:
     Example: sart evaluate skill --out evaluation.json --episodes 100 --workers 2
 
     Example: sart evaluate skill --out varied.json --vary-appearance --yaw-deg 15
+
+    Interrupted, it resumes when the same command is typed again.
     """
 
     skill: Annotated[Positional[Path], arg(metavar="SKILL", help="Directory from `sart train`.")]
@@ -455,6 +457,8 @@ class BenchmarkReplay:
     """How well a demonstration recorded on one backend replays on another.
 
     Example: sart benchmark replay --tasks all --backends pybullet,sapien --out replay.json
+
+    Interrupted, it resumes when the same command is typed again.
     """
 
     tasks: _TASKS = "all"
@@ -525,6 +529,8 @@ class BenchmarkCloud:
     """How radii from the recorded images compare with those from the true scene.
 
     Example: sart benchmark cloud --tasks all --out cloud.json
+
+    Interrupted, it resumes when the same command is typed again.
     """
 
     tasks: _TASKS = "all"

@@ -18,7 +18,7 @@ from sart_toolkit.cli.arguments import (
 from sart_toolkit.cli.console import ProgressDisplay, say, typed
 from sart_toolkit.cli.info import plain
 from sart_toolkit.data.records import library_versions
-from sart_toolkit.data.storage import check_writable, read_json, write_json
+from sart_toolkit.data.storage import OutputLock, check_writable, read_json, write_json
 from sart_toolkit.doctor import machine
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.robots import get_robot
@@ -85,9 +85,9 @@ def replay_verb(args: BenchmarkReplay) -> Result:
 
     with ProgressDisplay() as progress:
         result = benchmark_replay(
-            cells, args.seed, lambda done, wanted: progress("replay", done, wanted)
-        )
-    write_json(args.out, result)
+            cells, args.seed, args.out, args.overwrite,
+            lambda done, wanted: progress("replay", done, wanted),
+        )  # fmt: skip
     return {"benchmark": str(args.out)} | {
         f"{row['task']}: {row['recorded_on']} to {row['replayed_on']}": (
             f"{'success' if row['replayed_success'] else row['reason']}, "
@@ -163,9 +163,9 @@ def cloud_verb(args: BenchmarkCloud) -> Result:
 
     with ProgressDisplay() as progress:
         result = benchmark_clouds(
-            cells, args.seed, lambda done, wanted: progress("cloud", done, wanted)
-        )
-    write_json(args.out, _about() | result)
+            cells, args.seed, args.out, args.overwrite,
+            lambda done, wanted: progress("cloud", done, wanted), _about(),
+        )  # fmt: skip
     return {"benchmark": str(args.out)} | {
         name: f"{row['median_share']:.0%} of the exact radii at the median, at most "
         f"{row['largest_excess_mm']:+.1f} mm larger{_surface_line(row.get('surface_errors'))}"
@@ -189,8 +189,13 @@ def _about() -> Result:
 
 def skill_verb(args: BenchmarkSkill) -> Result:
     """`sart benchmark skill`: one `sart run` after the other, then their figures."""
-    rows: Result = {}
     pairs = _pairs(args.tasks, args.backends)
+    with OutputLock(args.out / "benchmark.json"):
+        return _skills(args, pairs)
+
+
+def _skills(args: BenchmarkSkill, pairs: list[tuple[str, str]]) -> Result:
+    rows: Result = {}
     for task, backend in pairs:
         at = get_task(task).name, get_backend(backend).name
         name, out = "/".join(at), args.out / "-".join(at)

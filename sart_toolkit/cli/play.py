@@ -10,7 +10,12 @@ from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Play
 from sart_toolkit.cli.console import ProgressDisplay
 from sart_toolkit.data.records import Demonstration
-from sart_toolkit.data.storage import check_writable, load_demonstration, load_recording
+from sart_toolkit.data.storage import (
+    OutputLock,
+    check_writable,
+    load_demonstration,
+    load_recording,
+)
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile
 from sart_toolkit.poses import check_positive
 
@@ -109,7 +114,8 @@ def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, A
     from sart_toolkit.report.player import film
     from sart_toolkit.report.video import write_video
 
-    with ProgressDisplay() as progress:
+    with OutputLock(args.out), ProgressDisplay() as progress:
+        check_writable(args.out, args.overwrite)
 
         def counted() -> Any:
             for i, frame in enumerate(film(playback, scene), 1):

@@ -11,7 +11,14 @@ import numpy as np
 from sart_toolkit.cli.arguments import Record
 from sart_toolkit.cli.console import say
 from sart_toolkit.data.records import Demonstration
-from sart_toolkit.data.storage import append_json_line, check_writable, remove, save_demonstration
+from sart_toolkit.data.storage import (
+    OutputLock,
+    append_json_line,
+    check_writable,
+    linked,
+    remove,
+    save_demonstration,
+)
 from sart_toolkit.errors import Discarded, NoDisplay
 from sart_toolkit.motion.controller import ControllerConfig
 from sart_toolkit.record.desk import RecordingDesk
@@ -58,11 +65,12 @@ def record_by_hand(
             append_json_line(args.status, status)
 
     backend.check_cameras(config.cameras)
-    if args.status is not None:
-        check_writable(args.status, args.overwrite)
-        remove(args.status)
+    status_lock = None if args.status is None else OutputLock(args.status)
     desk: RecordingDesk | None = None
     try:
+        if args.status is not None:
+            check_writable(args.status, args.overwrite)
+            remove(linked(args.status))
         start_sdl()
         device.connect()
         robot = backend.robot
@@ -85,6 +93,8 @@ def record_by_hand(
         raise NoDisplay(f"{error}; or let a script steer: --device scripted") from error
     finally:
         device.close()
+        if status_lock is not None:
+            status_lock.close()
     if desk.demonstration is None:
         raise Discarded("the recording was discarded, nothing was written; record again")
     return desk.demonstration

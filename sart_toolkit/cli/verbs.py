@@ -68,6 +68,9 @@ VERBS: Mapping[str, Verb] = {
     "doctor": Verb(arguments.Doctor, "sart_toolkit.cli.doctor:doctor_verb"),
 }
 
+# What an interruption leaves of these is resumed by the same command.
+RESUMING = ("run", "annotate", "augment", "train", "evaluate", "benchmark")
+
 
 def find_verb(words: list[str]) -> tuple[str, list[str]]:
     """The name of the verb that a command begins with, and the words after it.

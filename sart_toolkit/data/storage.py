@@ -13,11 +13,12 @@ import io
 import json
 import lzma
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -43,6 +44,9 @@ from sart_toolkit.errors import (
 
 SCHEMA_VERSION = 4
 
+# As `replacing` names them, with the eight characters of `mkstemp`.
+_TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}(\.(?!lock)\w+)?")
+
 
 # --- writing safely -----------------------------------------------------------------------------
 
@@ -64,19 +68,33 @@ def _cannot_write(path: Path) -> Iterator[None]:
         ) from error
 
 
+def linked(path: Path) -> Path:
+    """The absolute path that is written where `path` is: links are followed, not replaced.
+
+    Raises:
+        CannotWrite: a link leads in a circle.
+    """
+    found = Path(os.path.realpath(path))
+    if os.path.islink(found):
+        raise CannotWrite(f"{path}: is a link to itself; remove it or choose another --out")
+    return found
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` that becomes `path` when the block ends without an error.
 
+    Where `path` is a link, what it points to is replaced and the link stays.
+
     Raises:
         CannotWrite: the disk refuses; `path` is as it was.
     """
-    path = Path(path)
     temporary: Path | None = None
     with _cannot_write(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path, real = Path(path), linked(path)
+        real.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix
+            dir=real.parent, prefix=f".{path.stem}.", suffix=path.suffix
         )
         os.close(handle)
         temporary = Path(name)
@@ -87,7 +105,7 @@ def replacing(path: Path) -> Iterator[Path]:
             umask = os.umask(0)
             os.umask(umask)
             os.chmod(temporary, 0o666 & ~umask)
-            os.replace(temporary, path)
+            os.replace(temporary, real)
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -158,6 +176,103 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     return [row for row in rows if isinstance(row, dict)]
 
 
+class OutputLock:
+    """The right to write an output, a file or directory, that no other process has meanwhile.
+
+    It is an advisory lock on `.NAME.lock` beside the output, so neither replacing nor clearing the
+    output touches it; the kernel releases it when the process ends, however that happens.
+    """
+
+    def __init__(self, path: Path, nested: bool = False) -> None:
+        """Take the lock.
+
+        Args:
+            path: the output; where it is a link, what it points to.
+            nested: whether it is enough that this process holds the lock already, for a part of
+                what the holder does.
+
+        Raises:
+            CannotWrite: another process has it, or this one has and `nested` is false; or the
+                disk refuses.
+        """
+        self.path = Path(path)
+        self._real = real = linked(path)
+        self._lock = real.with_name(f".{real.name}.lock")
+        self._descriptor: int | None = None
+        self._made: list[Path] = []
+        if nested and real in _HELD:
+            return
+        check_writable(path, overwrite=True)
+        with _cannot_write(self.path):
+            try:
+                while self._descriptor is None:
+                    self._descriptor = self._taken()
+            except BaseException:
+                self._remove_made()
+                raise
+        _HELD.add(real)
+
+    def _taken(self) -> int | None:
+        """A descriptor that holds the lock; None where its last holder has just removed the file.
+
+        Raises:
+            CannotWrite: another process has it.
+        """
+        missing = [p for p in self._lock.parents if not p.exists()]
+        self._made += missing
+        self._lock.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            descriptor = os.open(self._lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except FileNotFoundError:
+            return None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(descriptor), os.stat(self._lock)):
+                return descriptor
+        except FileNotFoundError:
+            pass
+        except BlockingIOError:
+            os.close(descriptor)
+            raise CannotWrite(
+                f"{self.path}: another process is using it; end that one first, or choose another "
+                "--out"
+            ) from None
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+        return None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let others have it."""
+        if self._descriptor is None:
+            return
+        descriptor, self._descriptor = self._descriptor, None
+        _HELD.discard(self._real)
+        # Removed while it is held: who opened it meanwhile finds that it is no longer the file.
+        with contextlib.suppress(OSError):
+            self._lock.unlink()
+        os.close(descriptor)
+        self._remove_made()
+
+    def _remove_made(self) -> None:
+        """Remove the directories that only the lock was in."""
+        for directory in self._made:
+            try:
+                directory.rmdir()
+            except OSError:
+                return
+
+
+_HELD: set[Path] = set()
+
+
 class Journal:
     """Rows appended to a file of lines, each on the disk when `append` returns.
 
@@ -168,40 +283,47 @@ class Journal:
         rows: what it holds.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, lock: OutputLock | None = None) -> None:
         """Open a journal, made if needed.
+
+        Args:
+            path: the file.
+            lock: of the output that it is a journal of, released when the journal is closed; the
+                file's own if left out.
 
         Raises:
             CannotWrite: the disk refuses, or another process has it open.
         """
         self.path = Path(path)
-        with _cannot_write(self.path):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = open(self.path, "ab+")  # noqa: SIM115 - open until `close`
+        self._lock = lock or OutputLock(path)
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            self._file.close()
-            raise CannotWrite(
-                f"{self.path}: another process is using it; end that one first, or choose "
-                "another --out"
-            ) from error
-        self._file.seek(0)
-        content = self._file.read()
-        if not content.endswith(b"\n"):
-            self._file.truncate(content.rfind(b"\n") + 1)
-        self.rows = read_json_lines(self.path)
+            with _cannot_write(self.path):
+                linked(path).parent.mkdir(parents=True, exist_ok=True)
+                self._file = open(self.path, "ab+")  # noqa: SIM115 - open until `close`
+                self._file.seek(0)
+                content = self._file.read()
+                if not content.endswith(b"\n"):
+                    self._file.truncate(content.rfind(b"\n") + 1)
+            self.rows = read_json_lines(self.path)
+        except BaseException:
+            self._lock.close()
+            raise
 
     def append(self, row: Mapping[str, Any]) -> None:
         """Add one row.
 
         Raises:
             CannotWrite: the disk refuses.
+            InvalidInput: a number is NaN or infinite, or a value isn't JSON.
         """
+        try:
+            line = json.dumps(row, allow_nan=False).encode() + b"\n"
+        except (TypeError, ValueError) as error:
+            raise InvalidInput(f"{self.path}: can't be written as JSON: {error}") from error
         with _cannot_write(self.path):
             end = self._file.seek(0, os.SEEK_END)
             try:
-                self._file.write(json.dumps(row, allow_nan=False).encode() + b"\n")
+                self._file.write(line)
                 self._file.flush()
                 os.fsync(self._file.fileno())
             except OSError:
@@ -221,6 +343,7 @@ class Journal:
         if remove and not self._file.closed:
             self.path.unlink(missing_ok=True)
         self._file.close()
+        self._lock.close()
 
 
 def check_writable(path: Path, overwrite: bool = False) -> None:
@@ -230,11 +353,11 @@ def check_writable(path: Path, overwrite: bool = False) -> None:
         OutputExists: it is there and `overwrite` is false.
         CannotWrite: its nearest existing parent refuses new files.
     """
-    path = Path(path)
     with _cannot_write(path):
-        if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+        real = linked(path)
+        if real.exists() and not overwrite and not (real.is_dir() and not any(real.iterdir())):
             raise OutputExists(f"{path}: already exists; add --overwrite or choose another --out")
-        parent = path if path.is_dir() else path.parent
+        parent = real if real.is_dir() else real.parent
         while not parent.exists():
             parent = parent.parent
         if not parent.is_dir():
@@ -299,12 +422,30 @@ def check_replaceable(path: Path, mark: str, overwrite: bool) -> None:
 def clear_directory(path: Path, mark: str, overwrite: bool) -> None:
     """Make room for a directory that a stage writes: an empty one or none at all is left.
 
+    The mark goes last: interrupted, the directory can still be replaced.
+
     Raises:
         OutputExists: it is there and may not be replaced, see `check_replaceable`.
-        CannotWrite: the disk refuses.
+        CannotWrite: another process writes something in it, or the disk refuses.
     """
     check_replaceable(path, mark, overwrite)
-    remove(path)
+    if not Path(path).is_dir():
+        return
+    for lock in Path(path).rglob(".*.lock"):
+        OutputLock(lock.with_name(lock.name[1:].removesuffix(".lock"))).close()
+    for inside in sorted(Path(path).iterdir(), key=lambda inside: inside.name == mark):
+        remove(inside)
+
+
+def remove_temporary_files(directory: Path) -> None:
+    """Remove what processes that were killed while they wrote have left in a directory.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    for path in Path(directory).rglob(".*"):
+        if _TEMPORARY.fullmatch(path.name):
+            remove(path)
 
 
 def _existing(path: Path) -> Path:

@@ -27,9 +27,11 @@ from sart_toolkit.data.manifest import (
 from sart_toolkit.data.records import Annotation, Demonstration, Episode, library_versions
 from sart_toolkit.data.storage import (
     Journal,
+    OutputLock,
     check_replaceable,
     load_episode,
     remove,
+    remove_temporary_files,
     save_annotation,
     save_demonstration,
     save_episode,
@@ -127,9 +129,14 @@ class DatasetWriter:
         hashes = tuple((d.content_hash(), a.content_hash()) for d, a in sources)
         # As JSON gives it back, to be compared.
         wanted = Manifest(hashes, json.loads(json.dumps(dict(request))))
-        if not (path / MANIFEST).exists():
-            check_replaceable(path, MANIFEST, overwrite)
-        self._journal = Journal(path / MANIFEST)
+        lock = OutputLock(path)
+        try:
+            if not (path / MANIFEST).exists():
+                check_replaceable(path, MANIFEST, overwrite)
+        except BaseException:
+            lock.close()
+            raise
+        self._journal = Journal(path / MANIFEST, lock)
         try:
             self._manifest = self._opened(wanted, overwrite)
             self.files = EpisodeFiles(path)
@@ -174,8 +181,7 @@ class DatasetWriter:
     def _checked(self) -> Dataset | None:
         """The dataset if nothing is missing; what is broken is left to be made again."""
         # A process that was killed leaves the file that it was writing.
-        for temporary in self.path.rglob(".*"):
-            remove(temporary)
+        remove_temporary_files(self.path)
         manifest = self._manifest
         broken = [entry.key for entry in manifest.kept.values() if not self.files.hold(entry)]
         for key in broken:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import hashlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from sart_toolkit.backends.interface import (
     Backend,
@@ -23,8 +24,9 @@ from sart_toolkit.backends.interface import (
     missing_abilities,
     require,
 )
-from sart_toolkit.data.records import Image, Rates, apply_action, library_versions
-from sart_toolkit.data.storage import write_json
+from sart_toolkit.data.records import Image, Rates, apply_action, digest, library_versions
+from sart_toolkit.data.result_log import ResultLog
+from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.learn.skill import Skill, load_skill
@@ -188,10 +190,7 @@ class _Worker:
         make_backend: BackendFactory,
         config: EvaluateConfig,
         device: str,
-        threads: int | None,
     ) -> None:
-        if threads is not None:
-            torch.set_num_threads(threads)
         self.skill = load_skill(skill_directory, device)
         self.task, self.config = task, config
         self.backend = make_backend()
@@ -226,8 +225,13 @@ def evaluate_skill(
     device: str = "cpu",
     progress: Callable[[int, int, int], None] | None = None,
     film: Film | None = None,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Evaluate a skill on random placements; the result as in `evaluation.json`.
+
+    Neither the number of processes nor running a rollout again for a video changes what the policy
+    does: it computes with one thread everywhere. With `out`, finished rollouts are kept beside it
+    until all are done: interrupted, it resumes there.
 
     Args:
         skill_directory: the trained skill.
@@ -239,11 +243,14 @@ def evaluate_skill(
         device: where the policy runs.
         progress: called with (done, wanted, successes) after each rollout.
         film: makes the videos, such as `report.video.film_rollout`.
+        overwrite: replace `out`, and forget finished rollouts.
 
     Raises:
         MissingFile, BrokenFile: the skill can't be read.
         InvalidInput: `workers` is not positive, or videos are wanted without `film` or `out`.
-        CannotWrite: the disk refuses.
+        OutputExists: `out` is there and `overwrite` is false.
+        Mismatch: another evaluation into `out` was interrupted.
+        CannotWrite: another process is at work on `out`, or the disk refuses.
     """
     config = config or EvaluateConfig()
     if config.videos and (film is None or out is None):
@@ -251,47 +258,84 @@ def evaluate_skill(
             f"videos: expected 0 without `film` and `out`, got {config.videos}; pass "
             "film=sart_toolkit.film_rollout and where to write"
         )
-    skill = load_skill(skill_directory)
-    make_worker = functools.partial(
-        _Worker,
-        skill_directory,
-        task,
-        make_backend,
-        config,
-        device,
-    )
-    started = time.perf_counter()
-    rollouts: list[Rollout] = []
-    # Processes share the cores: a pool of threads in each would only make them wait.
-    threads = None if workers == 1 else 1
-    with worker_map(functools.partial(make_worker, threads), workers) as run:
-        for rollout in run(range(config.episodes)):
-            rollouts.append(rollout)
-            if progress is not None:
-                progress(len(rollouts), config.episodes, sum(r.success for r in rollouts))
-    seconds = time.perf_counter() - started
-    with closing(make_worker(None)) as worker:
-        result = _summary(rollouts, skill, task, worker.backend.name, config, seconds)
+    if workers < 1:
+        raise InvalidInput(f"workers: expected at least 1, got {workers}")
+    if out is not None:
+        check_writable(out, overwrite)
+    make_worker = functools.partial(_Worker, skill_directory, task, make_backend, config, device)
+    with contextlib.ExitStack() as stack:
+        worker = stack.enter_context(closing(make_worker()))
+        log = None
         if out is not None:
+            request = _request(skill_directory, task, worker, config)
+            log = stack.enter_context(ResultLog(out, request, overwrite))
+        run: Callable[[Iterable[int]], Iterator[Rollout]] = functools.partial(map, worker)
+        if workers > 1:
+            run = stack.enter_context(worker_map(make_worker, workers))
+        rows = _rows(run, task, config, log, progress)
+        result = _summary(rows, worker, task, config)
+        if out is not None and log is not None:
             if film is not None and config.videos:
-                result["videos"] = _videos(rollouts, worker, config, out.parent, film)
-            write_json(out, result)
+                result["videos"] = _videos(result["episodes"], worker, config, out.parent, film)
+            log.finish(result)
     return result
 
 
-def _summary(
-    rollouts: list[Rollout],
-    skill: Skill,
-    task: Task,
-    backend: str,
-    config: EvaluateConfig,
-    seconds: float,
+def _request(
+    skill_directory: Path, task: Task, worker: _Worker, config: EvaluateConfig
 ) -> dict[str, Any]:
-    n = len(rollouts)
-    now, ever = sum(r.success for r in rollouts), sum(r.success_any for r in rollouts)
+    """What decides a rollout, besides its number."""
+    files = (Path(skill_directory) / name for name in ("config.json", "model.safetensors"))
+    return {
+        "verb": "evaluate",
+        "skill": digest(
+            {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+        ),
+        "task": task.name,
+        "robot": worker.backend.robot.name,
+        "backend": worker.backend.name,
+        "image_size": worker.backend.image_size,
+        **{key: asdict(config)[key] for key in ("eval_seed", "yaw_deg", "vary_appearance")},
+    }
+
+
+def _rows(
+    run: Callable[[Iterable[int]], Iterator[Rollout]],
+    task: Task,
+    config: EvaluateConfig,
+    log: ResultLog | None,
+    progress: Callable[[int, int, int], None] | None,
+) -> list[dict[str, Any]]:
+    """The row of each rollout and the seconds that it took; only what isn't in the log is run."""
+    rows = {row["episode"]: row for row in log.rows} if log is not None else {}
+    wanted = range(config.episodes)
+    missing = [episode for episode in wanted if episode not in rows]
+    done = len(wanted) - len(missing)
+    successes = sum(rows[i]["outcome"] == "success" for i in wanted if i in rows)
+    began = time.perf_counter()
+    for episode, rollout in zip(missing, run(missing), strict=True):
+        now = time.perf_counter()
+        row = rollout.to_json(task.report_body) | {"seconds": now - began}
+        began = now
+        rows[episode] = row
+        if log is not None:
+            log.add(row)
+        done += 1
+        successes += rollout.success
+        if progress is not None:
+            progress(done, len(wanted), successes)
+    return [rows[episode] for episode in wanted]
+
+
+def _summary(
+    rows: Sequence[Mapping[str, Any]], worker: _Worker, task: Task, config: EvaluateConfig
+) -> dict[str, Any]:
+    n, skill = len(rows), worker.skill
+    now = sum(row["outcome"] == "success" for row in rows)
+    ever = sum(row["success_any"] for row in rows)
     return {
         "task": task.name,
-        "backend": backend,
+        "backend": worker.backend.name,
         "robot": skill.config.robot,
         "policy": skill.config.training.policy,
         "n_episodes": n,
@@ -301,17 +345,21 @@ def _summary(
         "n_success_any": ever,
         "success_rate_any": ever / n,
         "ci95_any": list(wilson_interval(ever, n)),
-        "seeds": {"eval_seed": config.eval_seed, "episodes": [list(r.seed) for r in rollouts]},
-        "seconds": seconds,
+        "seeds": {"eval_seed": config.eval_seed, "episodes": [row["seed"] for row in rows]},
+        "seconds": sum(row["seconds"] for row in rows),
         "config": asdict(config),
-        "episodes": [r.to_json(task.report_body) for r in rollouts],
+        "episodes": [{k: v for k, v in row.items() if k != "seconds"} for row in rows],
         "videos": [],
         "versions": library_versions(),
     }
 
 
 def _videos(
-    rollouts: list[Rollout], worker: _Worker, config: EvaluateConfig, directory: Path, film: Film
+    episodes: Sequence[Mapping[str, Any]],
+    worker: _Worker,
+    config: EvaluateConfig,
+    directory: Path,
+    film: Film,
 ) -> list[dict[str, Any]]:
     """Run the first successes and failures again, seen from outside as well, and film them."""
     if _OVERVIEW not in worker.backend.cameras or missing_abilities(worker.backend, [Draws]):
@@ -322,12 +370,12 @@ def _videos(
     rows = []
     outcomes: tuple[Literal["success", "failure"], ...] = ("success", "failure")
     for outcome in outcomes:
-        chosen = [r for r in rollouts if r.success == (outcome == "success")]
-        for rollout in chosen[: config.videos]:
-            name = f"videos/{outcome}_{rollout.episode:03d}.mp4"
+        chosen = [row["episode"] for row in episodes if row["outcome"] == outcome]
+        for episode in chosen[: config.videos]:
+            name = f"videos/{outcome}_{episode:03d}.mp4"
             hz = worker.skill.demonstration.rates.record_hz
-            film(directory / name, _moments(worker, rollout.episode), hz, rollout.episode, outcome)
-            rows.append({"path": name, "episode": rollout.episode, "outcome": outcome})
+            film(directory / name, _moments(worker, episode), hz, episode, outcome)
+            rows.append({"path": name, "episode": episode, "outcome": outcome})
     return rows
 
 

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from sart_toolkit.data.storage import SCHEMA_VERSION, replacing
-from sart_toolkit.errors import BrokenFile, MissingFile
+from sart_toolkit.errors import BrokenFile, CannotWrite, MissingFile
 
 _KEY = "sart_toolkit"
 
@@ -25,11 +25,16 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, 
     """
     header = json.dumps({"schema_version": SCHEMA_VERSION, **about}, allow_nan=False)
     with replacing(path) as temporary:
-        save_file(
-            {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
-            temporary,
-            metadata={_KEY: header},
-        )
+        try:
+            save_file(
+                {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
+                temporary,
+                metadata={_KEY: header},
+            )
+        except SafetensorError as error:
+            raise CannotWrite(
+                f"{path}: {error}; nothing was replaced, make room or choose another --out"
+            ) from error
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -20,7 +20,12 @@ import torch
 from torch import Tensor
 
 from sart_toolkit.data.dataset import Dataset
-from sart_toolkit.data.storage import check_writable
+from sart_toolkit.data.storage import (
+    OutputLock,
+    check_writable,
+    remove,
+    remove_temporary_files,
+)
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
 from sart_toolkit.learn.policies import POLICIES, get_policy
 from sart_toolkit.learn.policy import Policy, PolicySetup
@@ -249,7 +254,8 @@ def train(
 
     The dataset is read once, into files in `out` (see `open_windows`) from which batches are
     gathered. Checkpoints go to `out` every 30 seconds, at the end, and when interrupted (Ctrl-C
-    lets the step finish, a second one does not). A later call with the same dataset and options
+    lets the step finish, a second one does not; so does any signal that Python handles, as `sart`
+    has it handle SIGTERM and SIGHUP). A later call with the same dataset and options
     resumes from there, and ends with the weights of an uninterrupted run, bit for bit on the same
     CPU with the same number of threads.
 
@@ -258,7 +264,7 @@ def train(
         config: how to train.
         out: directory of the checkpoint and the windows; made if needed.
         progress: called after every step with steps done, steps in all, and a line of text.
-        resume: resume from a checkpoint in `out` if there is one; otherwise it is replaced.
+        resume: resume from a checkpoint in `out` if there is one; otherwise it is removed.
         reading: called after each trajectory of the dataset that was read, with how many of how
             many.
 
@@ -269,14 +275,20 @@ def train(
             another dataset, or the backbone weights don't fit.
         MissingFile: no such backbone weights.
         BrokenFile: damaged checkpoint or backbone weights.
-        CannotWrite: the disk refuses the checkpoint, or has no room for the images.
+        CannotWrite: another process is at work on `out`, or the disk refuses the checkpoint, or
+            has no room for the images.
         SartError: the loss is not finite any more.
     """
-    device = resolve_device(config.device)
-    check_writable(Path(out) / CHECKPOINT, overwrite=True)
-    windows = open_windows(dataset, _window_config(config), Path(out), reading)
-    with _torch_threads(config.threads), _deferred_interrupt() as interrupted:
-        return _Training(windows, config, Path(out), device, resume).run(progress, interrupted)
+    device, out = resolve_device(config.device), Path(out)
+    with OutputLock(out, nested=True):
+        check_writable(out / CHECKPOINT, overwrite=True)
+        remove_temporary_files(out)
+        if not resume:
+            # Interrupted before its first checkpoint, it must not resume from an older one.
+            remove(out / CHECKPOINT)
+        windows = open_windows(dataset, _window_config(config), out, reading)
+        with torch_threads(config.threads), _deferred_interrupt() as interrupt:
+            return _Training(windows, config, out, device).run(progress, interrupt)
 
 
 def _window_config(config: TrainConfig) -> WindowConfig:
@@ -293,7 +305,7 @@ class _Training:
     """What a run changes as it goes: weights, optimizer, and the place in the epoch."""
 
     def __init__(
-        self, windows: Windows, config: TrainConfig, out: Path, device: torch.device, resume: bool
+        self, windows: Windows, config: TrainConfig, out: Path, device: torch.device
     ) -> None:
         self.config = config
         self.device = device
@@ -304,7 +316,7 @@ class _Training:
         self.n_windows = int(windows.multiplicity.sum())
         self.n_batches = math.ceil(self.n_windows / config.batch_size)
 
-        resumes = resume and self.checkpoint.exists()
+        resumes = self.checkpoint.exists()
         self.policy = build_policy(config, windows.frames.layout.sizes)
         self.policy.set_normalisation(windows.normalisation())
         if config.backbone_weights is not None and not resumes:
@@ -320,7 +332,7 @@ class _Training:
         if resumes:
             self._restore()
 
-    def run(self, progress: Progress | None, interrupted: Callable[[], bool]) -> TrainResult:
+    def run(self, progress: Progress | None, interrupt: _DeferredInterrupt) -> TrainResult:
         config, n_steps = self.config, self.config.epochs * self.n_batches
         self.policy.train()
         saved = time.perf_counter()
@@ -338,12 +350,12 @@ class _Training:
                 if progress is not None:
                     progress(step + 1, n_steps, self._status())
                 self.seconds = time.perf_counter() - began
-                if interrupted() or time.perf_counter() - saved > _CHECKPOINT_SECONDS:
+                if interrupt.waiting or time.perf_counter() - saved > _CHECKPOINT_SECONDS:
                     self._save()
                     saved = time.perf_counter()
-                if interrupted():
+                if interrupt.waiting:
                     _log.warning("interrupted after step %d; train again to resume", step + 1)
-                    raise KeyboardInterrupt
+                    interrupt.carry_out()
             loss = self._finite_loss() / self.n_windows
             self.curve.append(EpochRecord(epoch + 1, loss, time.perf_counter() - began))
             self.batch, self.seconds = 0, 0.0
@@ -465,7 +477,8 @@ def _has_room(device: torch.device, windows: Windows) -> bool:
 
 
 @contextlib.contextmanager
-def _torch_threads(threads: int | None) -> Iterator[None]:
+def torch_threads(threads: int | None) -> Iterator[None]:
+    """Within it torch computes with so many threads, its own choice if None."""
     before = torch.get_num_threads()
     try:
         if threads is not None:
@@ -475,29 +488,51 @@ def _torch_threads(threads: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@contextlib.contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """A function that returns whether Ctrl-C was pressed; the second one interrupts at once.
+class _DeferredInterrupt:
+    """A signal that would have interrupted, kept until a step has finished.
 
-    Only a step that has finished leaves weights, optimizer and counters that belong together.
+    Only then do weights, optimizer and counters belong together.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
-        yield lambda: False
-        return
-    pressed = False
 
-    def handle(signum: int, frame: FrameType | None) -> None:
-        nonlocal pressed
-        if pressed:
-            raise KeyboardInterrupt
-        pressed = True
+    def __init__(self) -> None:
+        self.handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
+        self._signal: int | None = None
 
-    signal.signal(signal.SIGINT, handle)
+    @property
+    def waiting(self) -> bool:
+        """Whether a signal came."""
+        return self._signal is not None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if self.waiting:
+            self.handlers[number](number, frame)
+        self._signal = number
+
+    def carry_out(self) -> None:
+        """Interrupt, as the signal would have done at once."""
+        number, self._signal = self._signal, None
+        if number is not None:
+            self.handlers[number](number, None)
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _deferred_interrupt() -> Iterator[_DeferredInterrupt]:
+    """What Ctrl-C and the signals that ask a process to end are kept in; a second one isn't."""
+    interrupt = _DeferredInterrupt()
+    if threading.current_thread() is threading.main_thread():
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            handler = signal.getsignal(each)
+            # Neither what is ignored, nor what ends the process without asking Python.
+            if callable(handler):
+                interrupt.handlers[each] = handler
     try:
-        yield lambda: pressed
+        for number in interrupt.handlers:
+            signal.signal(number, interrupt)
+        yield interrupt
     finally:
-        signal.signal(signal.SIGINT, before or signal.default_int_handler)
+        for number, handler in interrupt.handlers.items():
+            signal.signal(number, handler)
 
 
 def _check_whole(name: str, value: Any, least: int) -> None:

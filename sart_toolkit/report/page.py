@@ -59,7 +59,22 @@ def write_report(run_dir: Path, out: Path) -> None:
         InvalidInput, Mismatch: a part holds a value that can't be, or belongs to another run.
         CannotWrite: the disk refuses.
     """
-    write_text(Path(out), _page(_load_run(Path(run_dir))))
+    try:
+        page = _page(_load_run(Path(run_dir)))
+        # Half a pair of UTF-16, which JSON lets pass, can't be written.
+        page.encode()
+    except SartError:
+        raise
+    # A number, list or name where a JSON file should hold something else.
+    except (
+        ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError,
+        ValueError, jinja2.TemplateError,
+    ) as error:  # fmt: skip
+        raise BrokenFile(
+            f"{run_dir}: one of its JSON files holds a value that can't be shown "
+            f"({type(error).__name__}: {error}); make that part of the run again"
+        ) from error
+    write_text(Path(out), page)
 
 
 # --- what a run holds ---------------------------------------------------------------------------

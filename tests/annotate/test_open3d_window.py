@@ -99,7 +99,7 @@ def test_ctrl_c_closes_the_window_and_keeps_the_work(
     program.send_signal(signal.SIGINT)
     _, err = program.communicate(timeout=60)
     assert program.returncode == 130, err
-    assert "type the same command again to resume" in err
+    assert "to resume type: sart annotate" in err
     assert len(rows(tmp_path)) == 3
 
 

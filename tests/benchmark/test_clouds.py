@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sart_toolkit.backends import make_backend
+from sart_toolkit.benchmark import clouds
 from sart_toolkit.benchmark.cells import Cell
 from sart_toolkit.benchmark.clouds import _on_robot, benchmark_clouds
 from sart_toolkit.robots import get_robot
@@ -13,12 +14,13 @@ from sart_toolkit.tasks import get_task
 
 
 @pytest.fixture(scope="module")
-def compared():
+def compared(tmp_path_factory):
     task = get_task("peg_in_hole")
     make = functools.partial(make_backend, "pybullet", get_robot(task.robot), task.scene, 96)
     seen = []
+    out = tmp_path_factory.mktemp("cloud") / "cloud.json"
     found = benchmark_clouds(
-        [Cell(task, "pybullet", make)], progress=lambda done, wanted: seen.append((done, wanted))
+        [Cell(task, "pybullet", make)], 0, out, progress=lambda *counts: seen.append(counts)
     )
     assert seen == [(1, 1)]
     return found
@@ -49,3 +51,23 @@ def test_a_point_on_the_robot_is_counted(peg_demonstration, peg_world):
     points = np.array([Ts[0], Ts[-1], [0.0, 2.0, 0.0]])
     assert _on_robot(points, peg_world, range(len(Ts))) == 2
     assert _on_robot(points, peg_world, range(1)) == 1
+
+
+def test_interrupted_it_keeps_the_cells_that_were_finished(
+    make_cell, peg_task, tmp_path, monkeypatch
+):
+    cells = [make_cell(peg_task), make_cell(get_task("lid_closing"))]
+    ran = []
+
+    def row(cell, seed):
+        ran.append(cell.name)
+        if len(ran) == 2:
+            raise KeyboardInterrupt
+        return {"spheres": [{"cloud": 1.0 + len(cell.name), "exact": 2.0}], "seed": seed}
+
+    monkeypatch.setattr(clouds, "_compared", row)
+    with pytest.raises(KeyboardInterrupt):
+        benchmark_clouds(cells, 0, tmp_path / "c.json")
+    again = benchmark_clouds(cells, 0, tmp_path / "c.json")
+    assert ran == [cells[0].name, cells[1].name, cells[1].name]
+    assert again == benchmark_clouds(cells, 0, tmp_path / "whole.json")

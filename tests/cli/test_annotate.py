@@ -141,7 +141,7 @@ def test_at_a_terminal_mistakes_are_reported_and_ctrl_c_keeps_the_work(demo, wai
     type_("q", "aren't saved")
     said.clear()
     process.send_signal(signal.SIGINT)
-    says("type the same command again to resume")()
+    says("finished parts are kept, to resume type: sart annotate")()
     assert process.wait(30) == 130
     os.close(here)
     assert demo.with_name("demo.annotation.json.journal").exists()

@@ -135,7 +135,10 @@ def test_a_row_that_was_cut_short_does_not_count(carry_out, tmp_path):
 
 def test_files_that_a_killed_process_was_writing_are_removed(carry_out, tmp_path):
     carry_out(tmp_path / "d", 3)
-    left = [tmp_path / "d/.dataset.x.json", tmp_path / "d/episodes/demo00/.sphere00_k00009.x.h5"]
+    left = [
+        tmp_path / "d/.dataset.x1y_z2w3.json",
+        tmp_path / "d/episodes/demo00/.sphere00_k00009.x1y_z2w3.h5",
+    ]
     for path in left:
         path.write_text("half")
     carry_out(tmp_path / "d")
@@ -145,8 +148,8 @@ def test_files_that_a_killed_process_was_writing_are_removed(carry_out, tmp_path
 _OTHER = """
 import sys
 from pathlib import Path
-from sart_toolkit.data.storage import Journal
-Journal(Path(sys.argv[1]))
+from sart_toolkit.data.storage import OutputLock
+OutputLock(Path(sys.argv[1]))
 """
 
 
@@ -172,9 +175,8 @@ def test_killed_at_any_moment_it_becomes_the_same(carry_out, tmp_path):
 def test_a_second_process_is_refused_while_the_first_is_at_work(carry_out, source_of, tmp_path):
     path = tmp_path / "d"
     with DatasetWriter(path, [source_of(0)], {"n": N}):
-        manifest = str(path / "manifest.jsonl")
         found = subprocess.run(
-            [sys.executable, "-c", _OTHER, manifest], capture_output=True, text=True
+            [sys.executable, "-c", _OTHER, str(path)], capture_output=True, text=True
         )
         assert "CannotWrite" in found.stderr and "another process is using it" in found.stderr
         for overwrite in (True, False):

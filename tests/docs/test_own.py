@@ -52,7 +52,7 @@ def interrupted(argv: list[str], manifest: Path, wait_until: Callable[..., None]
         )
         os.killpg(process.pid, signal.SIGINT)
         stderr = process.communicate(timeout=60)[1].decode()
-    assert process.returncode == 130 and "type the same command again" in stderr, stderr
+    assert process.returncode == 130 and "to resume type: sart augment" in stderr, stderr
 
 
 @pytest.mark.parametrize("kind", OWN)

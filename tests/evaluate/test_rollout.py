@@ -12,7 +12,14 @@ import torch
 
 from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.data.storage import read_json
-from sart_toolkit.errors import CannotWrite, InvalidInput, MissingFile, SartError
+from sart_toolkit.errors import (
+    CannotWrite,
+    InvalidInput,
+    Mismatch,
+    MissingFile,
+    OutputExists,
+    SartError,
+)
 from sart_toolkit.evaluate import rollout as module
 from sart_toolkit.evaluate.rollout import (
     EvaluateConfig,
@@ -163,12 +170,15 @@ def short_task():
 
 
 @pytest.fixture
-def evaluate(monkeypatch, make_peg_backend, tmp_path):
+def evaluate(monkeypatch, make_peg_backend, tmp_path_factory):
     """Evaluates a made-up skill in place of a trained one."""
+    directory = tmp_path_factory.mktemp("skill")
+    for name in ("config.json", "model.safetensors"):
+        (directory / name).write_text(name)
 
     def evaluate(skill, task, config=None, **options):
         monkeypatch.setattr(module, "load_skill", lambda *_, **__: skill)
-        return evaluate_skill(tmp_path, task, make_peg_backend, config, **options)
+        return evaluate_skill(directory, task, make_peg_backend, config, **options)
 
     return evaluate
 
@@ -274,6 +284,55 @@ def test_the_first_failures_are_handed_to_the_film_maker(evaluate, short_task, t
         assert moments[0].overview.shape != moments[0].wrist.shape
 
 
+def test_an_interrupted_evaluation_keeps_its_rollouts_and_ends_with_the_same_result(
+    evaluate, short_task, tmp_path
+):
+    config, played = EvaluateConfig(episodes=4, eval_seed=3), []
+
+    class Counted(Player):
+        def reset(self):
+            super().reset()
+            played.append(1)
+
+    def cut(done, wanted, successes):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "e.json"
+    whole = evaluate(Player(), short_task, config, out=tmp_path / "whole.json")
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(Counted(), short_task, config, out=out, progress=cut)
+    assert not out.exists() and len(played) == 3
+    with pytest.raises(Mismatch, match=r"e.json.journal: holds results of .* add --overwrite"):
+        evaluate(Counted(), short_task, dataclasses.replace(config, eval_seed=4), out=out)
+    resumed = evaluate(Counted(), short_task, config, out=out)
+    assert len(played) == 4
+    assert {**resumed, "seconds": 0} == {**whole, "seconds": 0}
+    assert resumed["seconds"] > 0 and read_json(out) == json.loads(json.dumps(resumed))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["e.json", "whole.json"]
+
+
+def test_a_finished_evaluation_is_replaced_only_if_asked(evaluate, short_task, tmp_path):
+    out, config = tmp_path / "e.json", EvaluateConfig(episodes=1)
+    evaluate(Player(), short_task, config, out=out)
+    before = out.read_bytes()
+    with pytest.raises(OutputExists, match="already exists; add --overwrite"):
+        evaluate(Player(), short_task, config, out=out)
+    assert out.read_bytes() == before
+    evaluate(Player(), short_task, EvaluateConfig(1, 7), out=out, overwrite=True)
+    assert read_json(out)["config"]["eval_seed"] == 7
+
+
+def test_two_evaluations_of_one_result_at_once_are_refused(evaluate, short_task, tmp_path):
+    def meanwhile(*counts):
+        for overwrite in (False, True):
+            with pytest.raises(CannotWrite, match="another process is using it"):
+                evaluate(Player(), short_task, out=tmp_path / "e.json", overwrite=overwrite)
+
+    evaluate(Player(), short_task, EvaluateConfig(2), out=tmp_path / "e.json", progress=meanwhile)
+    assert read_json(tmp_path / "e.json")["n_episodes"] == 2
+
+
 def test_without_a_camera_outside_there_are_no_videos_and_that_is_said(
     evaluate, short_task, tmp_path, monkeypatch, caplog
 ):
@@ -363,7 +422,7 @@ def test_a_missing_skill_is_refused(peg_task, make_peg_backend, tmp_path):
 
 def test_a_result_that_cannot_be_written_is_an_error(evaluate, short_task, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(CannotWrite, match="nothing was replaced"):
+    with pytest.raises(CannotWrite, match="is not a directory; choose another --out"):
         evaluate(
             Player(),
             short_task,

@@ -128,6 +128,27 @@ def test_a_policy_sees_images_and_gripper_and_nothing_else(spied):
     assert seen["gripper"].tolist() == [[0.25, 0.25]]
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_policy_acts_with_one_thread_and_leaves_torch_s_alone(spied, monkeypatch, threads):
+    skill, spy = spied
+    seen = []
+    predict = spy.predict
+
+    def counting(observation):
+        seen.append(torch.get_num_threads())
+        return predict(observation)
+
+    monkeypatch.setattr(spy, "predict", counting)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.25)
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1]
+
+
 def test_a_chunk_is_executed_before_the_policy_is_asked_again(spied):
     skill, spy = spied
     for step in range(4):

@@ -1,4 +1,5 @@
 import json
+import resource
 
 import pytest
 import torch
@@ -56,3 +57,17 @@ def test_a_disk_that_refuses_leaves_what_was_there(tmp_path):
     with pytest.raises(CannotWrite, match="file"):
         save_tensors(tmp_path / "file" / "a.safetensors", {"a": torch.zeros(1)}, {})
     assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_a_disk_that_fills_up_is_an_error_of_ours_and_leaves_the_old_file(tmp_path):
+    path = tmp_path / "x.safetensors"
+    save_tensors(path, {"w": torch.zeros(50_000)}, {"n": 1})
+    before = path.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, hard))
+    try:
+        with pytest.raises(CannotWrite, match=r"x.safetensors: .*; nothing was replaced, make roo"):
+            save_tensors(path, {"w": torch.ones(50_000)}, {"n": 2})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import resource
 import signal
 import threading
 
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from sart_toolkit import pipeline
+from sart_toolkit.data.storage import OutputLock
 from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, SartError, UnknownName
 from sart_toolkit.learn import training
 from sart_toolkit.learn.policies import POLICIES
@@ -187,6 +190,98 @@ def test_a_second_ctrl_c_interrupts_at_once(dataset, small_config, tmp_path):
     assert not (tmp_path / CHECKPOINT).exists()
 
 
+def test_other_signals_that_python_handles_also_let_the_step_finish(
+    dataset, small_config, tmp_path
+):
+    class Ended(BaseException):
+        pass
+
+    def end(number, frame):
+        raise Ended
+
+    def send(done, total, text):
+        if done == 7:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        with pytest.raises(Ended):
+            train(dataset, small_config, tmp_path / "cut", progress=send)
+        assert signal.getsignal(signal.SIGTERM) is end
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    seen = []
+    resumed = train(
+        dataset, small_config, tmp_path / "cut", progress=lambda done, *_: seen.append(done)
+    )
+    assert seen[0] == 8
+    assert _same_weights(train(dataset, small_config, tmp_path / "whole"), resumed)
+
+
+OPTIONS = {
+    "epochs": 3, "batch_size": 8, "image_size": 16, "image_shift": 1, "hidden": 16,
+    "device": "cpu", "threads": 1,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_training_is_overwritten_after_an_interruption_and_resumed_after_another(
+    finished, dataset, tmp_path
+):
+    def cut(stage, done, total, text=""):
+        if stage == "train" and done == 7:
+            raise KeyboardInterrupt
+
+    def train_policy(out, **changed):
+        pipeline.train_policy(dataset.path, tmp_path / out, **{**OPTIONS, **changed})
+        return load_tensors(tmp_path / out / "model.safetensors")[0]
+
+    out = tmp_path / "cut"
+    if finished:
+        train_policy("cut", lr=0.1)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            pipeline.train_policy(
+                dataset.path, out, **OPTIONS, lr=0.1, progress=lambda *args: _press(args, 7)
+            )
+        assert (out / CHECKPOINT).exists()
+    # Interrupted before its first checkpoint.
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.train_policy(dataset.path, out, **OPTIONS, overwrite=True, progress=cut)
+    resumed = train_policy("cut")
+    whole = train_policy("whole")
+    assert all(torch.equal(resumed[name], whole[name]) for name in whole)
+    assert sorted(p.name for p in out.iterdir()) == sorted(
+        p.name for p in (tmp_path / "whole").iterdir()
+    )
+
+
+def _press(progress, step):
+    if progress[:2] == ("train", step):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_two_processes_do_not_train_in_one_directory(dataset, small_config, tmp_path):
+    steps = []
+    with OutputLock(tmp_path / "skill"), pytest.raises(CannotWrite, match="another process"):
+        pipeline.train_policy(dataset.path, tmp_path / "skill", **OPTIONS, overwrite=True)
+    with pytest.raises(CannotWrite, match="another process"):
+
+        def meanwhile(done, total, text):
+            steps.append(done)
+            OutputLock(tmp_path / "skill")
+
+        train(dataset, small_config, tmp_path / "skill", progress=meanwhile)
+    assert steps == [1]
+
+
+def test_what_a_killed_training_was_writing_is_removed(dataset, small_config, tmp_path):
+    left = tmp_path / ".frames.abcd1234.bin"
+    left.write_bytes(b"half")
+    train(dataset, small_config, tmp_path)
+    assert not left.exists()
+
+
 def test_it_trains_in_a_thread_that_can_not_take_signals(dataset, small_config, tmp_path):
     results = []
     thread = threading.Thread(
@@ -358,6 +453,24 @@ def test_a_disk_that_refuses_is_reported_before_training(dataset, small_config, 
             progress=lambda *args: steps.append(args),
         )
     assert not steps
+
+
+def test_a_disk_that_fills_up_leaves_the_last_checkpoint_to_resume_from(
+    dataset, small_config, tmp_path
+):
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, small_config, tmp_path / "cut", progress=_press_ctrl_c_after(6))
+    before = (tmp_path / "cut" / CHECKPOINT).read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, hard))
+    try:
+        with pytest.raises(CannotWrite, match="nothing was replaced, make room or choose another"):
+            train(dataset, small_config, tmp_path / "cut")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (tmp_path / "cut" / CHECKPOINT).read_bytes() == before
+    whole = train(dataset, small_config, tmp_path / "whole")
+    assert _same_weights(whole, train(dataset, small_config, tmp_path / "cut"))
 
 
 def test_training_starts_from_backbone_weights(dataset, tmp_path):
