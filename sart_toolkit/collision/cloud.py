@@ -327,7 +327,8 @@ class _View:
         off = self.off(z, deviation[rows], 2.0)
         looks, agrees = np.zeros((2, len(p_world)), dtype=bool)
         v, u = np.divmod(pixels, self.depth.shape[1])
-        padded = np.pad(self.depth, 1)
+        # What the robot hides is not confirmed by the robot.
+        padded = np.pad(np.where(self.own, 0.0, self.depth), 1)
         for i, j in itertools.product(range(3), repeat=2):
             there = padded[v + i, u + j]
             agrees[rows] |= (there > 0) & (np.abs(there - z) <= off)
@@ -469,7 +470,8 @@ def fuse_cloud(
     config = config or CloudConfig()
     views = _views(demonstration, robot, waypoints, config)
     own = _OwnBody(demonstration, robot, held, grasped)
-    pixels = _scene_pixels(views, own, config)
+    _prepare(views, own, config)
+    pixels = _scene_pixels(views, config)
     cells = _merged(pixels, views, config)
     reached = cKDTree(demonstration.steps.measured_Ts_world_tool[:, :3, 3])
     near = reached.query(cells.points, distance_upper_bound=config.reach)[0] <= config.reach
@@ -527,8 +529,6 @@ def _views(
         keys = [keys[i] for i in np.linspace(0, len(keys) - 1, _MAX_IMAGES).round().astype(int)]
     views = [_View(demonstration, name, t, config.sensor) for t in keys for name in cameras]
     _related(views, config.sensor)
-    if config.sensor.flying:
-        _drop_unreal(views, config.sensor)
     if not any(view.depth.any() for view in views):
         raise InvalidInput(
             "cloud: expected depth [m] > 0 in some pixels, got 0 in all; record with a depth camera"
@@ -578,7 +578,8 @@ class _Cells:
     last: NDArray[np.int64]
 
 
-def _scene_pixels(views: Sequence[_View], own: _OwnBody, config: CloudConfig) -> _Pixels:
+def _prepare(views: Sequence[_View], own: _OwnBody, config: CloudConfig) -> None:
+    """Find each image's pixels of the robot itself, and drop those that show no surface."""
     sensor = config.sensor
     for view in views:
         shown = (view.depth > config.near) & (view.depth < config.far)
@@ -587,6 +588,13 @@ def _scene_pixels(views: Sequence[_View], own: _OwnBody, config: CloudConfig) ->
         off = sensor.systematic(far) + sensor.noise_bound(z) * far / z
         margin = np.maximum(config.self_margin, _OWN_LEAST + off)
         view.own[shown] = own.covers(p, view.waypoint, margin)
+    if sensor.flying:
+        _drop_unreal(views, sensor)
+
+
+def _scene_pixels(views: Sequence[_View], config: CloudConfig) -> _Pixels:
+    """What images show besides the robot, once they are prepared."""
+    sensor = config.sensor
     found = []
     for index, view in enumerate(views):
         shown = (view.depth > config.near) & (view.depth < config.far) & ~view.own
@@ -632,7 +640,7 @@ def _drop_unreal(views: Sequence[_View], sensor: SensorErrors) -> None:
     unreal = []
     for view in views:
         ways, alike = _continuity(view.depth, sensor)
-        odd = (view.depth > 0) & (ways < _CONTINUES)
+        odd = (view.depth > 0) & ~view.own & (ways < _CONTINUES)
         p, _, z, far = view.points(odd)
         deviation = sensor.deviation(z) * far / z
         looking, agreeing = np.zeros((2, len(p)), dtype=np.int64)
@@ -796,11 +804,12 @@ def grasped_object(
     held_at = tuple(_checked_waypoints(demonstration, after))
     own = _OwnBody(demonstration, robot, held, ())
     views = _views(demonstration, robot, held_at, config)
+    _prepare(views, own, config)
     Ts = demonstration.steps.measured_Ts_world_tool
     T_grasp = Ts[held_at[0]]
     if before is None:
         # In other images it is elsewhere.
-        pixels = _scene_pixels(views[:1], own, config)
+        pixels = _scene_pixels(views[:1], config)
         candidates, errors = pixels.points, pixels.systematic + 3 * pixels.deviation
     else:
         seen = fuse_cloud(
