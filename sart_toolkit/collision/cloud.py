@@ -173,29 +173,37 @@ class _OwnBody:
             self._models[opening] = RobotModel(self._robot, self._held, opening)
         return self._models[opening]
 
-    def covers(self, p_world: Array, t: int, margin: float | Array) -> NDArray[np.bool_]:
+    def covers(
+        self, p_world: Array, t: int, margin: float | Array, unsure: float = 0.0
+    ) -> NDArray[np.bool_]:
         """Which points `(n, 3)` the robot covers at waypoint `t`, grown by a margin [m].
 
-        There may be a margin `(n,)` for each point.
+        There may be a margin `(n,)` for each point. What is grasped is grown by `unsure` times its
+        error too.
         """
         model = self._model(float(self._steps.measured_gripper[t]))
         Ts_link = model.link_poses(self._steps.joint_positions[t])
-        hulls = [(hull, Ts_link[link]) for link, hull in self._parts]
+        hulls = [(hull, Ts_link[link], 0.0) for link, hull in self._parts]
         T_tool = self._steps.measured_Ts_world_tool[t]
-        hulls += [(hull, T_tool) for each, hull in self._grasped if t in each.waypoints]
-        centres = np.stack([T[:3, :3] @ hull.centre + T[:3, 3] for hull, T in hulls])
+        hulls += [
+            (hull, T_tool, unsure * each.error)
+            for each, hull in self._grasped
+            if t in each.waypoints
+        ]
         margins = np.broadcast_to(margin, p_world.shape[:1])
-        radii = np.array([hull.radius for hull, _ in hulls]) + margins.max(initial=0.0)
+        centres = np.stack([T[:3, :3] @ hull.centre + T[:3, 3] for hull, T, _ in hulls])
+        radii = np.array([hull.radius + more for hull, _, more in hulls])
+        radii = np.maximum(radii + margins.max(initial=-np.inf), 0.0)
         # |p - c|^2 = |p|^2 - 2 p.c + |c|^2: one product for all.
         squares = np.einsum("ij,ij->i", p_world, p_world)
         limits = radii**2 - np.einsum("ij,ij->i", centres, centres)
         candidates = squares - 2 * centres @ p_world.T <= limits[:, None]
         covered = np.zeros(len(p_world), dtype=bool)
-        for (hull, T), candidate in zip(hulls, candidates, strict=True):
+        for (hull, T, more), candidate in zip(hulls, candidates, strict=True):
             rows = np.flatnonzero(candidate & ~covered)
             if len(rows):
                 p = (p_world[rows] - T[:3, 3]) @ T[:3, :3]
-                covered[rows] = hull.near(p, margins[rows])
+                covered[rows] = hull.near(p, margins[rows] + more)
         return covered
 
 
@@ -480,7 +488,8 @@ def fuse_cloud(
         T = demonstration.steps.measured_Ts_world_tool[each.waypoints[0]]
         p_tool = (cells.points - T[:3, 3]) @ T[:3, :3]
         before = cells.last < each.waypoints[0]
-        keep &= ~(before & Hull(each.points).near(p_tool, config.self_margin))
+        margin = np.maximum(config.self_margin, cells.errors + each.error + _OWN_LEAST)
+        keep &= ~(before & Hull(each.points).near(p_tool, margin))
     if not keep.any():
         raise InvalidInput(
             f"cloud: expected something {config.near} to {config.far} m before the camera and "
@@ -587,7 +596,7 @@ def _prepare(views: Sequence[_View], own: _OwnBody, config: CloudConfig) -> None
         # The robot's own pixels are off as well.
         off = sensor.systematic(far) + sensor.noise_bound(z) * far / z
         margin = np.maximum(config.self_margin, _OWN_LEAST + off)
-        view.own[shown] = own.covers(p, view.waypoint, margin)
+        view.own[shown] = own.covers(p, view.waypoint, margin, unsure=1.0)
     if sensor.flying:
         _drop_unreal(views, sensor)
 
