@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -12,20 +12,60 @@ import numpy as np
 
 from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation, suggest_radius
 from sart_toolkit.benchmark.cells import Cell
+from sart_toolkit.benchmark.noise import as_measured
 from sart_toolkit.collision.cloud import fuse_cloud, surface_errors
 from sart_toolkit.collision.cloud_world import CloudWorld
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.parts import ConvexPart
-from sart_toolkit.data.records import library_versions
-from sart_toolkit.poses import Array
+from sart_toolkit.collision.sensor import CloudConfig, SensorErrors, sensor_errors
+from sart_toolkit.collision.world import CollisionWorld
+from sart_toolkit.data.records import Demonstration, PrecisionSphere, library_versions
+from sart_toolkit.poses import Array, check_positive
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.tasks.task import Placement
 
 # Where the two are compared, small radii count too.
 _LEAST_RADIUS = 0.0005
+# More than rounding [m].
+_LARGER = 1e-6
+# The hand-eye calibration's error in the noise table [m, deg], and the depth's scale.
+_HAND_EYE, _SCALE = (0.002, 0.3), 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """Images as a sensor with errors records them, read as one with `declared` errors.
+
+    `holes`: the share of pixels without depth.
+    """
+
+    errors: SensorErrors
+    declared: SensorErrors
+    holes: float = 0.0
+
+    @staticmethod
+    def honest(name: str, holes: float = 0.0, scale: float = 0.0) -> Recording:
+        """A named sensor's, its calibration off, everything declared."""
+        errors = sensor_errors(name, _HAND_EYE, scale)
+        return Recording(errors, errors, holes)
+
+
+RECORDINGS: Mapping[str, Recording] = {
+    "none": Recording.honest("exact"),
+    "D405-like": Recording.honest("d405"),
+    "D435-like": Recording.honest("d435", holes=0.05),
+    "none, depth scale +1 %": Recording.honest("exact", scale=_SCALE),
+    "D405-like, depth scale +1 %": Recording.honest("d405", scale=_SCALE),
+    "D435-like, depth scale +1 %": Recording.honest("d435", holes=0.05, scale=_SCALE),
+    # Shows that the comparison can fail.
+    "none, depth scale +1 %, nothing declared": Recording(
+        sensor_errors("exact", _HAND_EYE, _SCALE), SensorErrors()
+    ),
+}
 
 
 def benchmark_clouds(
@@ -76,14 +116,104 @@ def _on_robot(points: Array, world: ExactWorld, waypoints: Sequence[int]) -> int
     return int(covered.sum())
 
 
-def _compared(cell: Cell, seed: int) -> dict[str, Any]:
+def benchmark_noise(
+    cells: Sequence[Cell],
+    draws: int,
+    seed: int = 0,
+    recordings: Mapping[str, Recording] = RECORDINGS,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """For each cell and sensor, radii from noisy images against those from the true scene.
+
+    A demonstration is recorded once; its images are replaced, `draws` times for each sensor, by
+    what the sensor would have recorded. Spheres are where the exact suggestion has them. A radius
+    is too large if it exceeds the exact one there; a sphere is lost if its radius is less than a
+    suggestion's smallest.
+
+    Args:
+        cells: tasks and backends; the backends draw images.
+        draws: of the noise.
+        seed: of the scripted operator and of the noise.
+        recordings: the sensors by name.
+        progress: called with (draws done, draws in all).
+    """
+    check_positive("draws", draws)
+    rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    sizes, done = {}, 0
+    for cell in cells:
+        demonstration, robot = _demonstrated(cell, seed)
+        sizes[cell.name] = list(next(iter(demonstration.steps.cameras.values())).depth.shape[1:])
+        exact = ExactWorld(demonstration, robot, cell.task.scene)
+        spheres = suggest_annotation(demonstration, exact).spheres
+        radii = _radii(exact, spheres)
+        rows[cell.name] = {name: [] for name in recordings}
+        for name, recording in recordings.items():
+            for draw in range(draws):
+                rng = np.random.default_rng([seed, draw, 7])
+                noisy = as_measured(demonstration, recording.errors, recording.holes, rng)
+                config = CloudConfig(sensor=recording.declared)
+                started = time.perf_counter()
+                cloud = CloudWorld(noisy, robot, cell.task.scene, config=config)
+                found = _radii(cloud, spheres)
+                seconds = time.perf_counter() - started
+                rows[cell.name][name].append({"exact": radii, "cloud": found, "seconds": seconds})
+                done += 1
+                if progress is not None:
+                    progress(done, draws * len(cells) * len(recordings))
+    return {
+        "draws": draws,
+        "seed": seed,
+        "image_size": sizes,
+        "recordings": {name: dataclasses.asdict(each) for name, each in recordings.items()},
+        "total": {
+            name: _noise_totals([row for cell in rows.values() for row in cell[name]])
+            for name in recordings
+        },
+        "cells": {
+            cell: {name: _noise_totals(of) | {"draws": of} for name, of in by_name.items()}
+            for cell, by_name in rows.items()
+        },
+        "versions": library_versions(),
+    }
+
+
+def _radii(world: CollisionWorld, spheres: Sequence[PrecisionSphere]) -> list[float]:
+    """The largest radius [m] at each sphere's waypoint."""
+    config = SuggestConfig(min_radius=_LEAST_RADIUS)
+    return [
+        suggest_radius(world, world.demonstration, sphere.waypoint, config).radius
+        for sphere in spheres
+    ]
+
+
+def _noise_totals(draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    exact, cloud = (np.concatenate([draw[of] for draw in draws]) for of in ("exact", "cloud"))
+    share, kept = cloud / exact, cloud >= SuggestConfig().min_radius
+    return {
+        "n_radii": len(share),
+        "n_larger": int((cloud > exact + _LARGER).sum()),
+        "largest_excess_mm": float(1e3 * (cloud - exact).max()),
+        "median_share": float(np.median(share)),
+        "median_share_kept": float(np.median(share[kept])) if kept.any() else None,
+        "n_lost": int((~kept).sum()),
+        "seconds": float(np.median([draw["seconds"] for draw in draws])),
+    }
+
+
+def _demonstrated(cell: Cell, seed: int) -> tuple[Demonstration, RobotSpec]:
+    """The scripted operator's demonstration of a cell, with images, and the robot."""
     task = cell.task
     with closing(cell.make_backend()) as backend:
         robot = backend.robot
         model = RobotModel(robot, task.scene.held)
         plan = task.plan(task.initial_state(model, Placement()))
         operator = ScriptedOperator(plan, np.random.default_rng(seed))
-        demonstration = record_demonstration(backend, task, model, operator, seed=seed)
+        return record_demonstration(backend, task, model, operator, seed=seed), robot
+
+
+def _compared(cell: Cell, seed: int) -> dict[str, Any]:
+    task = cell.task
+    demonstration, robot = _demonstrated(cell, seed)
     exact = ExactWorld(demonstration, robot, task.scene)
     started = time.perf_counter()
     annotation = suggest_annotation(demonstration, exact)
@@ -112,12 +242,7 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
     if still > 1:
         fused = fuse_cloud(demonstration, robot, task.scene.held, range(still))
         bodies = {name: Ts[0] for name, Ts in demonstration.body_Ts_world.items()}
-        seen = dataclasses.replace(
-            fused,
-            points=fused.points[~fused.behind],
-            colours=fused.colours[~fused.behind],
-            behind=fused.behind[~fused.behind],
-        )
+        seen = fused.where(~fused.behind)
         distances = 1e3 * surface_errors(seen, task.scene, bodies)
         errors = {
             "points": len(seen),

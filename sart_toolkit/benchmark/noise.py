@@ -1,4 +1,4 @@
-"""What a real depth camera would have recorded in place of a simulated one: a model of its noise."""
+"""What a real depth camera would have recorded in place of a simulated one."""
 
 from __future__ import annotations
 

@@ -23,13 +23,12 @@ from scipy.stats import binom
 from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.parts import robot_parts
 from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
-from sart_toolkit.data.records import CameraRecord, Demonstration, Image, summary
+from sart_toolkit.data.records import Demonstration, Image, summary
 from sart_toolkit.errors import InvalidInput, Mismatch, unknown_name
 from sart_toolkit.poses import (
     Array,
     angle_between,
     check_array,
-    check_positive,
     frozen,
     inverse,
 )
@@ -375,9 +374,7 @@ def _tolerance(z: Array, voxel: float) -> Array:
     return np.maximum(_THROUGH_VOXELS * voxel, _THROUGH_SHARE * z)
 
 
-def _continuity(
-    depth: Array, sensor: SensorErrors
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _continuity(depth: Array, sensor: SensorErrors) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """In how many of twelve ways pixels `(H, W)` continue what is beside them, and how many of
     their eight neighbours are about as far away.
 
@@ -577,7 +574,8 @@ class _Pixels:
 class _Cells:
     """The cells that pixels fell into, by increasing number `(n,)`: mean point, mean colour.
 
-    `errors (n,)` [m]: how far the mean is off at most. `last (n,)` is the last waypoint at which an image saw something in it.
+    `errors (n,)` [m]: how far the mean is off at most. `last (n,)` is the last waypoint at which an
+    image saw something in it.
     """
 
     numbers: NDArray[np.int64]

@@ -44,6 +44,9 @@ class CloudWorld(CollisionWorld):
     A run of waypoints in which nothing new is touched, grasped or let go has a cloud of its own,
     from its own images: what was seen earlier may have been moved since. What is grasped counts
     as a part of the tool, its shape taken from the images before and after it was lifted.
+
+    Attributes:
+        config: how images become a cloud.
     """
 
     def __init__(
@@ -69,7 +72,7 @@ class CloudWorld(CollisionWorld):
         """
         super().__init__(demonstration, robot, scene, slip_tolerance)
         self._robot, self._held = robot, scene.held
-        self._config = config or CloudConfig()
+        self.config = config or CloudConfig()
         self._collision = CollisionModel(robot, SceneSpec((), scene.held))
         self._runs_seen: dict[range, _Seen] = {}
         self._shapes: dict[range, GraspedObject | None] = {}
@@ -145,7 +148,7 @@ class CloudWorld(CollisionWorld):
 
     def _fused(self, run: range, *grasped: GraspedObject) -> SceneCloud:
         about = self.demonstration, self._robot, self._held
-        return fuse_cloud(*about, run, self._config, grasped)
+        return fuse_cloud(*about, run, self.config, grasped)
 
     def _own_shape(self, run: range) -> GraspedObject | None:
         """What was in the grasp in a run of waypoints, as its own images show it."""
@@ -155,7 +158,7 @@ class CloudWorld(CollisionWorld):
             about = self.demonstration, self._robot, self._held
             first = self._run(0)
             before = None if first == run else first
-            self._shapes[run] = grasped_object(*about, run, before, self._config)
+            self._shapes[run] = grasped_object(*about, run, before, self.config)
         return self._shapes[run]
 
     def _same_grasp(self, run: range) -> list[range]:
@@ -180,5 +183,5 @@ class CloudWorld(CollisionWorld):
         feet = p.copy()
         feet[:, 2] = np.percentile(cloud.points[below, 2], 90)
         points = (np.concatenate([p, feet]) - T[:3, 3]) @ T[:3, :3]
-        error = float(cloud.inflation[below].max()) - self._config.inflation
+        error = float(cloud.inflation[below].max()) - self.config.inflation
         return dataclasses.replace(grasped, points=points, error=max(grasped.error, error))

@@ -59,7 +59,8 @@ class Hull:
     def near(self, p: Array, margin: float | Array) -> NDArray[np.bool_]:
         """Which points `(n, 3)` are inside the hull, its half-spaces grown by a margin [m].
 
-        There may be a margin `(n,)` for each point. The coarse axes cut off the far corners that a sharp edge's half-spaces grow.
+        There may be a margin `(n,)` for each point. The coarse axes cut off the far corners that a
+        sharp edge's half-spaces grow.
         """
         inside = self.coarse_bound(p) <= margin
         found = np.flatnonzero(inside)

@@ -159,5 +159,12 @@ class CloudConfig:
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> CloudConfig:
-        """The settings that `to_json` wrote."""
-        return CloudConfig(**{**values, "sensor": SensorErrors(**values["sensor"])})
+        """The settings that `to_json` wrote.
+
+        Raises:
+            InvalidInput: one is missing, unknown or not acceptable.
+        """
+        try:
+            return CloudConfig(**{**values, "sensor": SensorErrors(**values["sensor"])})
+        except (KeyError, TypeError) as error:
+            raise InvalidInput(f"cloud: a setting is missing or wrong ({error})") from error
