@@ -127,8 +127,8 @@ def benchmark_noise(
 
     A demonstration is recorded once; its images are replaced, `draws` times for each sensor, by
     what the sensor would have recorded. Spheres are where the exact suggestion has them. A radius
-    is too large if it exceeds the exact one there; a sphere is lost if its radius is less than a
-    suggestion's smallest.
+    is too large if it exceeds the exact one there and doesn't pass the exact suggestion's own
+    tests either; a sphere is lost if its radius is less than a suggestion's smallest.
 
     Args:
         cells: tasks and backends; the backends draw images.
@@ -156,7 +156,10 @@ def benchmark_noise(
                 cloud = CloudWorld(noisy, robot, cell.task.scene, config=config)
                 found = _radii(cloud, spheres)
                 seconds = time.perf_counter() - started
-                rows[cell.name][name].append({"exact": radii, "cloud": found, "seconds": seconds})
+                allowed = _allowed(exact, spheres, radii, found)
+                rows[cell.name][name].append(
+                    {"exact": radii, "allowed": allowed, "cloud": found, "seconds": seconds}
+                )
                 done += 1
                 if progress is not None:
                     progress(done, draws * len(cells) * len(recordings))
@@ -186,13 +189,37 @@ def _radii(world: CollisionWorld, spheres: Sequence[PrecisionSphere]) -> list[fl
     ]
 
 
+def _allowed(
+    exact: CollisionWorld,
+    spheres: Sequence[PrecisionSphere],
+    radii: Sequence[float],
+    found: Sequence[float],
+) -> list[float]:
+    """The largest radii [m] known to be right: the exact ones, or larger ones that pass as well.
+
+    Where what limits a radius is only probed, the arm itself, the exact one is shrunk in steps of a
+    tenth until it passes, so that one in between may pass the same tests.
+    """
+    allowed = []
+    for sphere, radius, other in zip(spheres, radii, found, strict=True):
+        if other > radius + _LARGER:
+            config = SuggestConfig(min_radius=_LEAST_RADIUS, max_radius=other)
+            at = suggest_radius(exact, exact.demonstration, sphere.waypoint, config)
+            radius = max(radius, at.radius)
+        allowed.append(radius)
+    return allowed
+
+
 def _noise_totals(draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    exact, cloud = (np.concatenate([draw[of] for draw in draws]) for of in ("exact", "cloud"))
+    exact, allowed, cloud = (
+        np.concatenate([draw[of] for draw in draws]) for of in ("exact", "allowed", "cloud")
+    )
     share, kept = cloud / exact, cloud >= SuggestConfig().min_radius
     return {
         "n_radii": len(share),
-        "n_larger": int((cloud > exact + _LARGER).sum()),
-        "largest_excess_mm": float(1e3 * (cloud - exact).max()),
+        "n_larger": int((cloud > allowed + _LARGER).sum()),
+        "n_larger_but_passing": int((allowed > exact + _LARGER).sum()),
+        "largest_excess_mm": float(1e3 * (cloud - allowed).max()),
         "median_share": float(np.median(share)),
         "median_share_kept": float(np.median(share[kept])) if kept.any() else None,
         "n_lost": int((~kept).sum()),

@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from sart_toolkit.collision.sensor import SensorErrors
 from sart_toolkit.data.records import CameraRecord, Demonstration, DepthImage
 from sart_toolkit.data.sampling import sample_direction
-from sart_toolkit.poses import Array, pose
+from sart_toolkit.poses import pose
 
 # Neighbours whose depths differ by this [m] have an edge between them.
 _EDGE = 0.02
@@ -51,7 +51,7 @@ def as_measured(
 
 def _measured(
     depth: DepthImage, errors: SensorErrors, holes: float, rng: np.random.Generator
-) -> Array:
+) -> DepthImage:
     z = depth.astype(np.float64)
     seen = z > 0
     flat = z.ravel().copy()
@@ -70,4 +70,5 @@ def _measured(
     z += (errors.noise + errors.noise_quadratic * z**2) * rng.standard_normal(z.shape)
     if errors.step:
         z = np.round(z / errors.step) * errors.step
-    return np.where(seen & (rng.uniform(size=z.shape) >= holes), np.maximum(z, 0.0), 0.0)
+    found = seen & (rng.uniform(size=z.shape) >= holes)
+    return np.where(found, np.maximum(z, 0.0), 0.0).astype(np.float32)

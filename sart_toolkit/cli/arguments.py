@@ -82,8 +82,7 @@ _SENSOR = Annotated[
     Literal["exact", "d405", "d435"] | None,
     _optional(
         "{exact,d405,d435}",
-        "With --source cloud: noise, flying pixels and holes of the depth camera; exact if left "
-        "out.",
+        "With --source cloud: noise and flying pixels of the depth camera; exact if left out.",
     ),
 ]
 _HAND_EYE = Annotated[

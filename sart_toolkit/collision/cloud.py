@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -36,6 +37,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape
 from sart_toolkit.scenes.spec import SceneSpec
 
+_log = logging.getLogger(__name__)
 # An image sees through a point when everything around it is farther by this.
 _THROUGH_VOXELS, _THROUGH_SHARE = 2.0, 0.03
 # Between two images used the camera has moved or turned by at least this [m, rad].
@@ -48,6 +50,8 @@ _KNOWN_SHARE, _WIDEST = 6.5 / 9, 5
 _ODD_DEVIATIONS, _ODD_LEAST, _CONTINUES = 2.5, 0.001, 5
 # It isn't alone if so many of its neighbours are as far away, to this fraction.
 _ALIKE, _ALIKE_SHARE, _IN_LINE = 2, 0.02, 3
+# Images are compared at every third pixel of each row and column, where they share so many.
+_SPARSE, _FEWEST = 3, 100
 # No image is more certain than this [m].
 _LEAST_OFF = 0.0001
 # So likely is it at most that as many images agree by chance with a pixel that shows nothing.
@@ -71,7 +75,7 @@ class SceneCloud:
     colours: Image
     behind: NDArray[np.bool_]
     config: CloudConfig = field(default_factory=CloudConfig)
-    inflation: Array = field(default=None)  # type: ignore[assignment]
+    inflation: Array = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         points = check_array("points", self.points, (None, 3))
@@ -87,7 +91,7 @@ class SceneCloud:
                 f"{behind.shape}"
             )
         inflation = self.inflation
-        if inflation is None:
+        if not len(inflation):
             inflation = np.full(len(points), self.config.inflation)
         inflation = check_array("inflation", inflation, points.shape[:1])
         if not (inflation > 0).all():
@@ -119,8 +123,13 @@ class SceneCloud:
 
     def where(self, keep: NDArray[np.bool_]) -> SceneCloud:
         """The points for which `keep (n,)` is true."""
-        arrays = (self.points, self.colours, self.behind)
-        return SceneCloud(*(a[keep] for a in arrays), self.config, self.inflation[keep])
+        return SceneCloud(
+            self.points[keep],
+            self.colours[keep],
+            self.behind[keep],
+            self.config,
+            self.inflation[keep],
+        )
 
 
 @dataclass(frozen=True)
@@ -476,6 +485,7 @@ def fuse_cloud(
     views = _views(demonstration, robot, waypoints, config)
     own = _OwnBody(demonstration, robot, held, grasped)
     _prepare(views, own, config)
+    _check_agreement(views, config)
     pixels = _scene_pixels(views, config)
     cells = _merged(pixels, views, config)
     reached = cKDTree(demonstration.steps.measured_Ts_world_tool[:, :3, 3])
@@ -599,6 +609,47 @@ def _prepare(views: Sequence[_View], own: _OwnBody, config: CloudConfig) -> None
         _drop_unreal(views, sensor)
 
 
+def _check_agreement(views: Sequence[_View], config: CloudConfig) -> None:
+    """Return if the images of each camera show the same surfaces, or warn if not quite.
+
+    What counts is the median by which depths differ from those that another image leads to, and
+    what is declared of the sensor explains. It finds only what differs between two poses.
+
+    Raises:
+        Mismatch: they don't: the camera isn't where it is recorded to be.
+    """
+    worst, explained, camera = 0.0, 0.0, ""
+    for a, b in itertools.combinations(views, 2):
+        if a.camera != b.camera:
+            continue
+        some = np.zeros(a.depth.shape, dtype=bool)
+        some[::_SPARSE, ::_SPARSE] = True
+        some &= (a.depth > config.near) & (a.depth < config.far) & ~a.own
+        p, _, _, _ = a.points(some)
+        rows, pixels, z = b.project(p)
+        depth = np.where(b.own, 0.0, b.depth).ravel()[pixels]
+        shown = depth > 0
+        if shown.sum() < _FEWEST:
+            continue
+        z = z[shown]
+        found = float(np.median(np.abs(depth[shown] - z)))
+        expected = float(np.median(b.off(z, config.sensor.deviation(z), 1.0)))
+        if found - expected > worst - explained:
+            worst, explained, camera = found, expected, a.camera
+        if found > expected + float(np.median(_tolerance(z, config.voxel))):
+            raise Mismatch(
+                f"camera {a.camera!r}: its images of waypoints {a.waypoint} and {b.waypoint} "
+                f"differ by {found * 1e3:.0f} mm from where they are said to be taken; calibrate "
+                "the camera, and see whether it is recorded on what it is mounted on, tool or world"
+            )
+    if worst > explained:
+        _log.warning(
+            "camera %r: images differ by %.1f mm, what is declared explains %.1f mm; calibrate it, "
+            "or declare more (--hand-eye-error, --depth-scale-error)",
+            camera, worst * 1e3, explained * 1e3,
+        )  # fmt: skip
+
+
 def _scene_pixels(views: Sequence[_View], config: CloudConfig) -> _Pixels:
     """What images show besides the robot, once they are prepared."""
     sensor = config.sensor
@@ -611,8 +662,11 @@ def _scene_pixels(views: Sequence[_View], config: CloudConfig) -> _Pixels:
             others = [other for other in views if other is not view]
             p, systematic, deviation = _agreed(p, systematic, deviation, others)
         found.append((p, colours, systematic, deviation, np.full(len(p), index)))
-    p, *rest = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    return _Pixels(p, *rest, _cell_numbers(p, config.voxel))
+    p, colours, systematic, deviation, image = (
+        np.concatenate(arrays) for arrays in zip(*found, strict=True)
+    )
+    cell = _cell_numbers(p, config.voxel)
+    return _Pixels(p, colours, systematic, deviation, image, cell)
 
 
 def _agreed(
