@@ -153,7 +153,7 @@ def cloud_verb(args: BenchmarkCloud) -> Result:
     if args.noise:
         with ProgressDisplay() as progress:
             result = benchmark_noise(
-                cells, args.noise, args.seed,
+                cells, args.noise, args.seed, workers=args.workers,
                 progress=lambda done, wanted: progress("cloud", done, wanted),
             )  # fmt: skip
         write_json(args.out, _about() | result)
