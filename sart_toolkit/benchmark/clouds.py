@@ -34,8 +34,8 @@ from sart_toolkit.workers import worker_map
 _LEAST_RADIUS = 0.0005
 # More than rounding [m].
 _LARGER = 1e-6
-# The hand-eye calibration's error in the noise table [m, deg], and the depth's scale.
-_HAND_EYE, _SCALE = (0.002, 0.3), 0.01
+# The hand-eye calibration's error in the noise table [m, deg].
+_HAND_EYE = (0.002, 0.3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,9 +50,9 @@ class Recording:
     holes: float = 0.0
 
     @staticmethod
-    def honest(name: str, holes: float = 0.0, scale: float = 0.0) -> Recording:
-        """A named sensor's, its calibration off, everything declared."""
-        errors = sensor_errors(name, _HAND_EYE, scale)
+    def honest(name: str, holes: float = 0.0) -> Recording:
+        """A named sensor's, its hand-eye calibration off, everything declared."""
+        errors = sensor_errors(name, _HAND_EYE)
         return Recording(errors, errors, holes)
 
 
@@ -60,10 +60,7 @@ RECORDINGS: Mapping[str, Recording] = {
     "none": Recording.honest("exact"),
     "D405-like": Recording.honest("d405"),
     "D435-like": Recording.honest("d435", holes=0.05),
-    "none, depth scale +1 %": Recording.honest("exact", scale=_SCALE),
 }
-# Shows that the comparison can fail.
-UNDECLARED = Recording(sensor_errors("exact", _HAND_EYE, _SCALE), SensorErrors())
 
 
 def benchmark_clouds(

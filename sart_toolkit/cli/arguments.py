@@ -562,7 +562,7 @@ class BenchmarkCloud:
     backends: _BACKENDS = "pybullet"
     seed: _SEED = 0
     noise: Annotated[int, arg(help="Noise draws for each task and sensor; 0: images as drawn.")] = 0
-    workers: _WORKERS = 1
+    workers: Annotated[int, arg(help="Processes to use, with --noise.")] = 1
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_cloud.json")
     overwrite: _OVERWRITE = False
     json: _JSON = False

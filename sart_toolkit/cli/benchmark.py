@@ -20,6 +20,7 @@ from sart_toolkit.cli.info import plain
 from sart_toolkit.data.records import library_versions
 from sart_toolkit.data.storage import check_writable, read_json, write_json
 from sart_toolkit.doctor import machine
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks import TASKS, get_task
 
@@ -150,6 +151,8 @@ def cloud_verb(args: BenchmarkCloud) -> Result:
     check_writable(args.out, args.overwrite)
     from sart_toolkit.benchmark.clouds import benchmark_clouds, benchmark_noise
 
+    if args.workers != 1 and not args.noise:
+        raise InvalidInput("--workers: radii without noise take one process; add --noise")
     if args.noise:
         with ProgressDisplay() as progress:
             result = benchmark_noise(

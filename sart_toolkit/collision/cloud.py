@@ -276,6 +276,10 @@ class _View:
             self._nearest[reach] = smallest
         return self._nearest[reach]
 
+    def forget(self) -> None:
+        """Forget what was worked out from the depth: it has changed."""
+        self._nearest.clear()
+
     def points(self, chosen: NDArray[np.bool_]) -> tuple[Array, Image, Array, Array]:
         """What chosen pixels `(H, W)` show.
 
@@ -331,9 +335,10 @@ class _View:
     def confirms(
         self, p_world: Array, deviation: Array
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which of points `(n, 3)` of another image it could show, and which it does.
+        """Of which points `(n, 3)` of another image it says something, and which it shows.
 
-        It could if nothing stands before them, and does if one of nine pixels has their depth.
+        It shows those whose depth one of nine pixels has, and denies those behind which all nine
+        are.
 
         Args:
             p_world: the points.
@@ -348,8 +353,8 @@ class _View:
         for i, j in itertools.product(range(3), repeat=2):
             there = padded[v + i, u + j]
             agrees[rows] |= (there > 0) & (np.abs(there - z) <= off)
-        depth = self.depth.ravel()[pixels]
-        looks[rows] = (depth > z - off) & (depth > 0) | agrees[rows]
+        # The edge of a thing may be a pixel from where it is drawn: beside one nothing is denied.
+        looks[rows] = agrees[rows] | (self.nearest(1).ravel()[pixels] > z + off)
         return looks, agrees
 
     def where_shown(self, p_world: Array, deviation: Array) -> _Shown:
@@ -721,6 +726,7 @@ def _drop_unreal(views: Sequence[_View], sensor: SensorErrors) -> None:
         unreal.append(mask)
     for view, mask in zip(views, unreal, strict=True):
         view.depth[mask] = 0.0
+        view.forget()
 
 
 def _merged(pixels: _Pixels, views: Sequence[_View], config: CloudConfig) -> _Cells:
