@@ -1,4 +1,4 @@
-"""The noise model does what is declared, and the table of radii from noisy images counts honestly."""
+"""The noise model does what is declared, and the noise table counts honestly."""
 
 import dataclasses
 import functools
