@@ -878,6 +878,10 @@ def grasped_object(
         # In other images it is elsewhere.
         pixels = _scene_pixels(views[:1], config)
         candidates, errors = pixels.points, pixels.systematic + 3 * pixels.deviation
+        if config.sensor.flying:
+            # Its corners are elsewhere in other images, which is taken for a pixel that flies.
+            far = np.linalg.norm(candidates - views[0].T_world_camera[:3, 3], axis=1)
+            errors = errors + far / views[0].intrinsics[0, 0]
     else:
         seen = fuse_cloud(
             demonstration, robot, held, before, dataclasses.replace(config, unknown="free")

@@ -139,7 +139,13 @@ class CloudWorld(CollisionWorld):
             assert grasped is not None
             grasped = dataclasses.replace(grasped, waypoints=tuple(run))
         elif run.start > 0:
-            grasped = self._down_to_support(grasped, self._seen(self._run(0)).cloud)
+            # What it stood on is seen best before it was lifted; else where it has left.
+            seen = grasped
+            if not self.phases[0].grasped:
+                seen = self._down_to_support(grasped, self._seen(self._run(0)).cloud)
+            if seen is grasped:
+                seen = self._down_to_support(grasped, self._fused(run, grasped))
+            grasped = seen
         cloud = self._fused(run, grasped)
         T = self._collision.T_joint_tool
         points = grasped.points @ T[:3, :3].T + T[:3, 3]
