@@ -318,6 +318,7 @@ def world_of(
     from sart_toolkit.collision import make_world
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
 
+    _check_sensor(source, sensor)
     spec, scene = robot_of(demonstration, robot), task_of(demonstration, task).scene
     cloud = CloudConfig(unknown=unknown, sensor=sensor or SensorErrors())
     return make_world(source, demonstration, spec, scene, slip_tolerance, cloud)
@@ -415,6 +416,7 @@ def augment(
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.engine import augment_demonstration
 
+    _check_sensor(options.get("obstacles"), sensor)
     if options.get("obstacles") == "cloud" and "cloud" not in options:
         options["cloud"] = _cloud_of(spheres, sensor)
     config = AugmentConfig(**options)
@@ -424,6 +426,12 @@ def augment(
         demonstration, spheres, make, out, config, workers, overwrite,
         lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
     )  # fmt: skip
+
+
+def _check_sensor(source: str | None, sensor: SensorErrors | None) -> None:
+    """Return if no sensor is given but for obstacles from images."""
+    if sensor is not None and source != "cloud":
+        raise InvalidInput("sensor: is about the recorded RGB-D, not the scene; leave it out")
 
 
 def _cloud_of(annotation: Annotation, sensor: SensorErrors | None) -> CloudConfig:

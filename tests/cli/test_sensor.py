@@ -46,6 +46,11 @@ def test_an_error_that_is_negative_is_refused():
         parsed("--source cloud --hand-eye-error=-2,0.3")
 
 
+def test_in_python_a_sensor_for_obstacles_of_the_scene_is_refused_as_well(peg_demonstration):
+    with pytest.raises(InvalidInput, match="sensor: is about the recorded RGB-D, not the scene"):
+        pipeline.world_of(peg_demonstration, "scene", sensor=SensorErrors())
+
+
 def annotation(settings):
     return Annotation((PrecisionSphere(0, np.eye(4), 0.1),), "hash", settings=settings)
 
