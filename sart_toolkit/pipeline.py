@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
     from sart_toolkit.backends.interface import Backend, BackendFactory
+    from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
     from sart_toolkit.collision.world import CollisionWorld
     from sart_toolkit.evaluate.rollout import Film, Rollout
     from sart_toolkit.learn.policy import Policy
@@ -326,13 +327,18 @@ def world_of(
     slip_tolerance: float = 0.005,
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
+    sensor: SensorErrors | None = None,
 ) -> CollisionWorld:
-    """Where the obstacles of a demonstration are, from its scene or from its images alone."""
-    from sart_toolkit.collision import make_world
-    from sart_toolkit.collision.cloud import CloudConfig
+    """Where the obstacles of a demonstration are, from its scene or from its images alone.
 
+    `sensor`: with "cloud", what its images may be off by; nothing if left out.
+    """
+    from sart_toolkit.collision import make_world
+    from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
+
+    _check_sensor(source, sensor)
     spec, scene = robot_of(demonstration, robot), task_of(demonstration, task).scene
-    cloud = CloudConfig(unknown=unknown)
+    cloud = CloudConfig(unknown=unknown, sensor=sensor or SensorErrors())
     return make_world(source, demonstration, spec, scene, slip_tolerance, cloud)
 
 
@@ -344,6 +350,7 @@ def suggest(
     waypoints: tuple[int, ...] = (),
     source: Literal["scene", "cloud"] = "scene",
     unknown: Literal["behind", "free"] = "behind",
+    sensor: SensorErrors | None = None,
     slip_tolerance: float = 0.005,
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
@@ -359,6 +366,7 @@ def suggest(
         waypoints: key waypoints; chosen to tile the free part if left out.
         source: what is known of obstacles.
         unknown: with "cloud": what space behind what was seen counts as.
+        sensor: with "cloud": what the images may be off by; nothing if left out.
         slip_tolerance: how far what is grasped may move in the grasp [m].
         task, robot: in place of those that the demonstration notes.
         overwrite: whether `out` may be replaced.
@@ -376,7 +384,7 @@ def suggest(
     from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
 
     config = SuggestConfig(**options)
-    world = world_of(demonstration, source, unknown, slip_tolerance, task, robot)
+    world = world_of(demonstration, source, unknown, slip_tolerance, task, robot, sensor)
     n = len(demonstration)
     annotation = suggest_annotation(
         demonstration, world, waypoints or None, config,
@@ -398,6 +406,7 @@ def augment(
     workers: int = 1,
     overwrite: bool = False,
     progress: Progress = _silent,
+    sensor: SensorErrors | None = None,
     **options: Any,
 ) -> Dataset:
     """Trajectories generated from a demonstration's and an annotation's file, in directory `out`.
@@ -410,6 +419,8 @@ def augment(
         workers: processes.
         overwrite: whether `out` may be replaced.
         progress: called with the trajectories kept.
+        sensor: with `obstacles` "cloud", what the images may be off by; if left out, what the
+            annotation says, where its spheres were suggested from the images.
         options: of `AugmentConfig`.
 
     Raises:
@@ -424,6 +435,9 @@ def augment(
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.engine import augment_demonstration
 
+    _check_sensor(options.get("obstacles"), sensor)
+    if options.get("obstacles") == "cloud" and "cloud" not in options:
+        options["cloud"] = _cloud_of(spheres, sensor)
     config = AugmentConfig(**options)
     size, rates = image_size_of(demonstration), demonstration.rates
     make = backend_maker(demonstration, size, rates, task, robot, backend)
@@ -431,6 +445,21 @@ def augment(
         demonstration, spheres, make, out, config, workers, overwrite,
         lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
     )  # fmt: skip
+
+
+def _check_sensor(source: str | None, sensor: SensorErrors | None) -> None:
+    """Return if no sensor is given but for obstacles from images."""
+    if sensor is not None and source != "cloud":
+        raise InvalidInput("sensor: is about the recorded RGB-D, not the scene; leave it out")
+
+
+def _cloud_of(annotation: Annotation, sensor: SensorErrors | None) -> CloudConfig:
+    """How images become a cloud, as an annotation says, with another sensor if one is given."""
+    from sart_toolkit.collision.sensor import CloudConfig
+
+    settings = annotation.settings.get("cloud")
+    cloud = CloudConfig() if settings is None else CloudConfig.from_json(settings)
+    return cloud if sensor is None else dataclasses.replace(cloud, sensor=sensor)
 
 
 def validate(

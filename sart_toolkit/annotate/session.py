@@ -21,6 +21,7 @@ from sart_toolkit.annotate.suggest import (
     proved_radius,
     suggest_annotation,
     suggest_radius,
+    suggestion_settings,
 )
 from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import (
@@ -355,7 +356,8 @@ class AnnotationSession:
             raise InvalidInput("nothing to save: there is no sphere yet; add one first")
         base = [_row(s) for s in self._base]
         own = any(s.source == "suggested" and _row(s) not in base for s in self.spheres)
-        settings = dataclasses.asdict(self.config.suggest) if own else self._base_settings
+        found = suggestion_settings(self._world, self.config.suggest)
+        settings = found if own else self._base_settings
         return Annotation(self.spheres, self._hash, round(self.seconds, 1), settings)
 
     def close(self) -> None:

@@ -6,10 +6,12 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
 
+from sart_toolkit.collision.cloud_world import CloudWorld
 from sart_toolkit.collision.model import PairDistance, PlacedModel
 from sart_toolkit.collision.phases import Phase
 from sart_toolkit.collision.world import CollisionWorld
@@ -446,6 +448,14 @@ def _room_before_event(
     return Suggestion(max(0.0, farthest - 1e-6), None, f"{what} at waypoint {event}")
 
 
+def suggestion_settings(world: CollisionWorld, config: SuggestConfig) -> dict[str, Any]:
+    """How radii are suggested, as JSON values; from a cloud, how that is made too."""
+    settings = dataclasses.asdict(config)
+    if isinstance(world, CloudWorld):
+        settings["cloud"] = world.config.to_json()
+    return settings
+
+
 def suggest_annotation(
     demonstration: Demonstration,
     world: CollisionWorld,
@@ -521,5 +531,7 @@ def suggest_annotation(
             "demonstration farther from the scene, or lower min_radius"
         )
     return Annotation(
-        tuple(spheres), demonstration.content_hash(), settings=dataclasses.asdict(config)
+        tuple(spheres),
+        demonstration.content_hash(),
+        settings=suggestion_settings(world, config),
     )

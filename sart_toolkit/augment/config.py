@@ -13,6 +13,7 @@ from sart_toolkit.augment import STRATEGIES, get_strategy
 from sart_toolkit.augment.strategies import Strategy
 from sart_toolkit.collision import SOURCES, Source
 from sart_toolkit.collision.phases import IN_GRASP_SLIP
+from sart_toolkit.collision.sensor import CloudConfig
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
@@ -29,11 +30,12 @@ class AugmentConfig:
     spheres, weighted by radius, or with `allocation` "equal" all the same, as in the paper.
     `duration` [s] is the paper's delta, the least that a segment takes, rounded up to whole
     recorded steps. Every segment is proved to keep `margin` [m] free of the `obstacles`, the bodies
-    of the scene or the cloud that the demonstration's cameras saw: as measured, even if what is
-    grasped has slipped by `slip_tolerance` [m] and bodies have moved by `BODY_STILLNESS`; as
-    commanded, even if the robot is off its path by its backend's `tracking_error` besides. A
-    segment on which any of these was exceeded is rejected. `cameras`: whose images are recorded,
-    `None` for those of the demonstration. `executor`: how segments are executed.
+    of the scene or the cloud that the demonstration's cameras saw (made as `cloud` says): as
+    measured, even if what is grasped has slipped by `slip_tolerance` [m] and bodies have moved by
+    `BODY_STILLNESS`; as commanded, even if the robot is off its path by its backend's
+    `tracking_error` besides. A segment on which any of these was exceeded is rejected. `cameras`:
+    whose images are recorded, `None` for those of the demonstration. `executor`: how segments are
+    executed.
     `strategy` may be given as an object; its reference is kept.
     """
 
@@ -45,6 +47,7 @@ class AugmentConfig:
     margin: float = 0.0002
     slip_tolerance: float = IN_GRASP_SLIP
     obstacles: Source = "scene"
+    cloud: CloudConfig = field(default_factory=CloudConfig)
     seed: int = 0
     cameras: tuple[str, ...] | None = None
     executor: str = "restore"
@@ -76,7 +79,10 @@ class AugmentConfig:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> AugmentConfig:
         """The settings that `to_json` wrote."""
-        return cls(**{**values, "sampling": SamplingConfig(**values["sampling"])})
+        sampling, cloud = SamplingConfig(**values["sampling"]), CloudConfig()
+        if "cloud" in values:
+            cloud = CloudConfig.from_json(values["cloud"])
+        return cls(**{**values, "sampling": sampling, "cloud": cloud})
 
     def quotas(self, radii: Sequence[float], demonstrations: int = 1) -> list[int]:
         """How many trajectories spheres of the given radii [m] get, of n less the demonstrations.

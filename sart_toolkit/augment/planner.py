@@ -133,7 +133,9 @@ def world_of(
         Mismatch: the demonstration is of another robot, or doesn't tell where the scene's bodies
             were.
     """
-    return make_world(config.obstacles, demonstration, robot, scene, config.slip_tolerance)
+    return make_world(
+        config.obstacles, demonstration, robot, scene, config.slip_tolerance, config.cloud
+    )
 
 
 def path_deviation(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -14,22 +15,56 @@ import numpy as np
 
 from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation, suggest_radius
 from sart_toolkit.benchmark.cells import Cell
+from sart_toolkit.benchmark.noise import as_measured
 from sart_toolkit.collision.cloud import fuse_cloud, surface_errors
 from sart_toolkit.collision.cloud_world import CloudWorld
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.parts import ConvexPart
-from sart_toolkit.data.records import library_versions
+from sart_toolkit.collision.sensor import CloudConfig, SensorErrors, sensor_errors
+from sart_toolkit.collision.world import CollisionWorld
+from sart_toolkit.data.records import Demonstration, PrecisionSphere, library_versions
 from sart_toolkit.data.result_log import ResultLog
-from sart_toolkit.poses import Array
+from sart_toolkit.poses import Array, check_positive
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.tasks.task import Placement
+from sart_toolkit.workers import worker_map
 
 # Where the two are compared, small radii count too.
 _LEAST_RADIUS = 0.0005
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
+# More than rounding [m].
+_LARGER = 1e-6
+# The hand-eye calibration's error in the noise table [m, deg].
+_HAND_EYE = (0.002, 0.3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """Images as a sensor with errors records them, read as one with `declared` errors.
+
+    `holes`: the share of pixels without depth.
+    """
+
+    errors: SensorErrors
+    declared: SensorErrors
+    holes: float = 0.0
+
+    @staticmethod
+    def honest(name: str, holes: float = 0.0) -> Recording:
+        """A named sensor's, its hand-eye calibration off, everything declared."""
+        errors = sensor_errors(name, _HAND_EYE)
+        return Recording(errors, errors, holes)
+
+
+RECORDINGS: Mapping[str, Recording] = {
+    "none": Recording.honest("exact"),
+    "D405-like": Recording.honest("d405"),
+    "D435-like": Recording.honest("d435", holes=0.05),
+}
 
 
 def benchmark_clouds(
@@ -102,14 +137,157 @@ def _on_robot(points: Array, world: ExactWorld, waypoints: Sequence[int]) -> int
     return int(covered.sum())
 
 
-def _compared(cell: Cell, seed: int) -> dict[str, Any]:
+def benchmark_noise(
+    cells: Sequence[Cell],
+    draws: int,
+    seed: int = 0,
+    recordings: Mapping[str, Recording] = RECORDINGS,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """For each cell and sensor, radii from noisy images against those from the true scene.
+
+    A demonstration is recorded once; its images are replaced, `draws` times for each sensor, by
+    what the sensor would have recorded. Spheres are where the exact suggestion has them. A radius
+    is too large if it exceeds the exact one there and doesn't pass the exact suggestion's own
+    tests either; a sphere is lost if its radius is less than a suggestion's smallest.
+
+    Args:
+        cells: tasks and backends; the backends draw images.
+        draws: of the noise.
+        seed: of the scripted operator and of the noise.
+        recordings: the sensors by name.
+        workers: processes.
+        progress: called with (cells done, cells in all).
+    """
+    check_positive("draws", draws)
+    sizes, rows = {}, {}
+    work = functools.partial(_NoiseCell, cells, draws, seed, recordings)
+    with worker_map(work, workers) as run:
+        names = [cell.name for cell in cells]
+        for name, (size, found) in zip(names, run(names), strict=True):
+            sizes[name], rows[name] = size, found
+            if progress is not None:
+                progress(len(rows), len(cells))
+    return {
+        "draws": draws,
+        "seed": seed,
+        "image_size": sizes,
+        "recordings": {name: dataclasses.asdict(each) for name, each in recordings.items()},
+        "total": {
+            name: _noise_totals([row for cell in rows.values() for row in cell[name]])
+            for name in recordings
+        },
+        "cells": {
+            cell: {name: _noise_totals(of) | {"draws": of} for name, of in by_name.items()}
+            for cell, by_name in rows.items()
+        },
+        "versions": library_versions(),
+    }
+
+
+class _NoiseCell:
+    """Radii from all noisy images of a cell."""
+
+    def __init__(
+        self,
+        cells: Sequence[Cell],
+        draws: int,
+        seed: int,
+        recordings: Mapping[str, Recording],
+    ) -> None:
+        self._cells = {cell.name: cell for cell in cells}
+        self._draws, self._seed, self._recordings = draws, seed, recordings
+
+    def __call__(self, name: str) -> tuple[list[int], dict[str, list[dict[str, Any]]]]:
+        """The images' size, and for each sensor the radii of each draw."""
+        cell = self._cells[name]
+        demonstration, robot = _demonstrated(cell, self._seed)
+        size = next(iter(demonstration.steps.cameras.values())).depth.shape[1:]
+        exact = ExactWorld(demonstration, robot, cell.task.scene)
+        spheres = suggest_annotation(demonstration, exact).spheres
+        radii = _radii(exact, spheres)
+        rows: dict[str, list[dict[str, Any]]] = {of: [] for of in self._recordings}
+        for of, recording in self._recordings.items():
+            for draw in range(self._draws):
+                rng = np.random.default_rng([self._seed, draw, 7])
+                noisy = as_measured(demonstration, recording.errors, recording.holes, rng)
+                config = CloudConfig(sensor=recording.declared)
+                started = time.perf_counter()
+                cloud = CloudWorld(noisy, robot, cell.task.scene, config=config)
+                found = _radii(cloud, spheres)
+                seconds = time.perf_counter() - started
+                allowed = _allowed(exact, spheres, radii, found)
+                rows[of].append(
+                    {"exact": radii, "allowed": allowed, "cloud": found, "seconds": seconds}
+                )
+        return [int(pixels) for pixels in size], rows
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def _radii(world: CollisionWorld, spheres: Sequence[PrecisionSphere]) -> list[float]:
+    """The largest radius [m] at each sphere's waypoint."""
+    config = SuggestConfig(min_radius=_LEAST_RADIUS)
+    return [
+        suggest_radius(world, world.demonstration, sphere.waypoint, config).radius
+        for sphere in spheres
+    ]
+
+
+def _allowed(
+    exact: CollisionWorld,
+    spheres: Sequence[PrecisionSphere],
+    radii: Sequence[float],
+    found: Sequence[float],
+) -> list[float]:
+    """The largest radii [m] known to be right: the exact ones, or larger ones that pass as well.
+
+    Where what limits a radius is only probed, the arm itself, the exact one is shrunk in steps of a
+    tenth until it passes, so that one in between may pass the same tests.
+    """
+    allowed = []
+    for sphere, radius, other in zip(spheres, radii, found, strict=True):
+        if other > radius + _LARGER:
+            config = SuggestConfig(min_radius=_LEAST_RADIUS, max_radius=other)
+            at = suggest_radius(exact, exact.demonstration, sphere.waypoint, config)
+            radius = max(radius, at.radius)
+        allowed.append(radius)
+    return allowed
+
+
+def _noise_totals(draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    exact, allowed, cloud = (
+        np.concatenate([draw[of] for draw in draws]) for of in ("exact", "allowed", "cloud")
+    )
+    share, kept = cloud / exact, cloud >= SuggestConfig().min_radius
+    return {
+        "n_radii": len(share),
+        "n_larger": int((cloud > allowed + _LARGER).sum()),
+        "n_larger_but_passing": int((allowed > exact + _LARGER).sum()),
+        "largest_excess_mm": float(1e3 * (cloud - allowed).max()),
+        "median_share": float(np.median(share)),
+        "median_share_kept": float(np.median(share[kept])) if kept.any() else None,
+        "n_lost": int((~kept).sum()),
+        "seconds": float(np.median([draw["seconds"] for draw in draws])),
+    }
+
+
+def _demonstrated(cell: Cell, seed: int) -> tuple[Demonstration, RobotSpec]:
+    """The scripted operator's demonstration of a cell, with images, and the robot."""
     task = cell.task
     with closing(cell.make_backend()) as backend:
         robot = backend.robot
         model = RobotModel(robot, task.scene.held)
         plan = task.plan(task.initial_state(model, Placement()))
         operator = ScriptedOperator(plan, np.random.default_rng(seed))
-        demonstration = record_demonstration(backend, task, model, operator, seed=seed)
+        return record_demonstration(backend, task, model, operator, seed=seed), robot
+
+
+def _compared(cell: Cell, seed: int) -> dict[str, Any]:
+    task = cell.task
+    demonstration, robot = _demonstrated(cell, seed)
     exact = ExactWorld(demonstration, robot, task.scene)
     started = time.perf_counter()
     annotation = suggest_annotation(demonstration, exact)
@@ -138,12 +316,7 @@ def _compared(cell: Cell, seed: int) -> dict[str, Any]:
     if still > 1:
         fused = fuse_cloud(demonstration, robot, task.scene.held, range(still))
         bodies = {name: Ts[0] for name, Ts in demonstration.body_Ts_world.items()}
-        seen = dataclasses.replace(
-            fused,
-            points=fused.points[~fused.behind],
-            colours=fused.colours[~fused.behind],
-            behind=fused.behind[~fused.behind],
-        )
+        seen = fused.where(~fused.behind)
         distances = 1e3 * surface_errors(seen, task.scene, bodies)
         errors = {
             "points": len(seen),

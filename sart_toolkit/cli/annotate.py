@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from sart_toolkit import doctor, pipeline
 from sart_toolkit.cli.arguments import Annotate
 from sart_toolkit.cli.console import say
+from sart_toolkit.cli.sensor import declared_sensor
 from sart_toolkit.cli.suggest import describe_spheres
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.storage import (
@@ -38,6 +39,7 @@ _WITHOUT = "or work without a window: --text, or --suggest-all --no-window"
 def annotate_verb(args: Annotate) -> dict[str, Any]:
     """`sart annotate`."""
     pipeline.check_names(task=args.task, robot=args.robot)
+    declared_sensor(args)
     headless = args.no_window and not args.text
     if headless and not args.suggest_all:
         raise InvalidInput("--no-window: leaves nothing to do; add --suggest-all, or --text")
@@ -69,8 +71,9 @@ def _annotate(args: Annotate, out: Path, headless: bool, lock: OutputLock) -> di
             None if args.overwrite or not out.exists() else _annotation_at(out, demonstration)
         )
         world = pipeline.world_of(
-            demonstration, args.source, args.unknown, args.slip_tolerance, args.task, args.robot
-        )
+            demonstration, args.source, args.unknown, args.slip_tolerance, args.task, args.robot,
+            declared_sensor(args),
+        )  # fmt: skip
         if probe is not None and not (finding := probe.result()).ok:
             raise MissingCapability(f"no window: {finding.detail}; {finding.remedy}; {_WITHOUT}")
     journal = Journal(journal_path, lock)

@@ -78,6 +78,27 @@ _UNKNOWN = Annotated[
     Literal["behind", "free"],
     arg(help="With --source cloud: space behind what was seen counts as solid, or as free."),
 ]
+_SENSOR = Annotated[
+    Literal["exact", "d405", "d435"] | None,
+    _optional(
+        "{exact,d405,d435}",
+        "With --source cloud: noise and flying pixels of the depth camera; exact if left out.",
+    ),
+]
+_HAND_EYE = Annotated[
+    str | None,
+    _optional(
+        "MM,DEG",
+        "With --source cloud: how far the camera may be from where it is recorded to be, as in "
+        "2,0.3; nothing if left out.",
+    ),
+]
+_DEPTH_SCALE = Annotated[
+    float | None,
+    _optional(
+        "PERCENT", "With --source cloud: largest error of the depth's scale; none if left out."
+    ),
+]
 _TOOL_MARGIN = Annotated[float, arg(help="Distance kept free around the tool [m].")]
 _MIN_RADIUS = Annotated[float, arg(help="Smallest radius of a sphere [m].")]
 _MAX_RADIUS = Annotated[float, arg(help="Largest radius of a sphere [m].")]
@@ -211,6 +232,9 @@ class Suggest:
     Example: sart suggest demo.h5 --out annotation.json --waypoints 0 18 --margin 0.005
 
     Example: sart suggest demo.h5 --out annotation.json --source cloud
+
+    Example: sart suggest demo.h5 --out annotation.json --source cloud --sensor d405
+        --hand-eye-error 2,0.3
     """
 
     demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
@@ -227,6 +251,9 @@ class Suggest:
     robot: _NOTED_ROBOT = None
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
+    sensor: _SENSOR = None
+    hand_eye_error: _HAND_EYE = None
+    depth_scale_error: _DEPTH_SCALE = None
     margin: _TOOL_MARGIN = 0.0008
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
@@ -267,6 +294,9 @@ class Annotate:
     robot: _NOTED_ROBOT = None
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
+    sensor: _SENSOR = None
+    hand_eye_error: _HAND_EYE = None
+    depth_scale_error: _DEPTH_SCALE = None
     margin: _TOOL_MARGIN = 0.0008
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
@@ -287,7 +317,9 @@ class Augment:
 
     Example: sart augment demo.h5 annotation.json --out dataset --source cloud
 
-    An interrupted generation resumes when the same command is typed again.
+    With --source cloud, images are read as the annotation says, where its spheres were suggested
+    from them; flags about the sensor replace that. An interrupted generation resumes when the same
+    command is typed again.
     """
 
     demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
@@ -316,6 +348,9 @@ class Augment:
         ),
     ] = 2.0
     source: _SOURCE = "scene"
+    sensor: _SENSOR = None
+    hand_eye_error: _HAND_EYE = None
+    depth_scale_error: _DEPTH_SCALE = None
     margin: Annotated[
         float,
         arg(
@@ -528,7 +563,13 @@ class BenchmarkRadii:
 class BenchmarkCloud:
     """How radii from the recorded images compare with those from the true scene.
 
+    With --noise the images are replaced by what real depth cameras would have recorded, their
+    errors being declared: that of the hand-eye calibration in each, 2 mm and 0.3 deg.
+
     Example: sart benchmark cloud --tasks all --out cloud.json
+
+    Example: sart benchmark cloud --tasks toolbox_picking,door_opening --noise 3
+        --out cloud_noise.json
 
     Interrupted, it resumes when the same command is typed again.
     """
@@ -536,6 +577,8 @@ class BenchmarkCloud:
     tasks: _TASKS = "all"
     backends: _BACKENDS = "pybullet"
     seed: _SEED = 0
+    noise: Annotated[int, arg(help="Noise draws for each task and sensor; 0: images as drawn.")] = 0
+    workers: Annotated[int, arg(help="Processes to use, with --noise.")] = 1
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_cloud.json")
     overwrite: _OVERWRITE = False
     json: _JSON = False

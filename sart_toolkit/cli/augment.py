@@ -8,12 +8,14 @@ from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Augment, Validate
 from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.info import describe_dataset
+from sart_toolkit.cli.sensor import declared_sensor
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import Mismatch
 
 
 def augment_verb(args: Augment) -> dict[str, Any]:
     """`sart augment`."""
+    sensor = declared_sensor(args)
     with ProgressDisplay() as progress:
         dataset = pipeline.augment(
             args.demo,
@@ -25,6 +27,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
             workers=args.workers,
             overwrite=args.overwrite,
             progress=progress,
+            sensor=sensor,
             n=args.n,
             allocation=args.allocation,
             strategy=args.strategy,

@@ -159,8 +159,23 @@ def cloud_verb(args: BenchmarkCloud) -> Result:
     """`sart benchmark cloud`."""
     cells = _cells(args.tasks, args.backends)
     check_writable(args.out, args.overwrite)
-    from sart_toolkit.benchmark.clouds import benchmark_clouds
+    from sart_toolkit.benchmark.clouds import benchmark_clouds, benchmark_noise
 
+    if args.workers != 1 and not args.noise:
+        raise InvalidInput("--workers: radii without noise take one process; add --noise")
+    if args.noise:
+        with ProgressDisplay() as progress:
+            result = benchmark_noise(
+                cells, args.noise, args.seed, workers=args.workers,
+                progress=lambda done, wanted: progress("cloud", done, wanted),
+            )  # fmt: skip
+        write_json(args.out, _about() | result)
+        return {"benchmark": str(args.out)} | {
+            name: f"{row['n_larger']} of {row['n_radii']} radii too large; "
+            f"{row['median_share']:.0%} of the exact radii at the median, "
+            f"{row['n_lost']} spheres lost"
+            for name, row in result["total"].items()
+        }
     with ProgressDisplay() as progress:
         result = benchmark_clouds(
             cells, args.seed, args.out, args.overwrite,

@@ -7,11 +7,13 @@ from typing import Any
 from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Suggest
 from sart_toolkit.cli.console import ProgressDisplay
+from sart_toolkit.cli.sensor import declared_sensor
 from sart_toolkit.data.records import Annotation
 
 
 def suggest_verb(args: Suggest) -> dict[str, Any]:
     """`sart suggest`."""
+    sensor = declared_sensor(args)
     with ProgressDisplay() as progress:
         annotation = pipeline.suggest(
             args.demo,
@@ -19,6 +21,7 @@ def suggest_verb(args: Suggest) -> dict[str, Any]:
             waypoints=args.waypoints,
             source=args.source,
             unknown=args.unknown,
+            sensor=sensor,
             slip_tolerance=args.slip_tolerance,
             task=args.task,
             robot=args.robot,

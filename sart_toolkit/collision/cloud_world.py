@@ -30,8 +30,9 @@ _BESIDE = 0.03
 
 
 class _Seen(NamedTuple):
-    """The obstacles of a run of waypoints, and what is in the grasp there, also as a part."""
+    """The cloud of a run of waypoints, and what is in the grasp there, also as a part."""
 
+    cloud: SceneCloud
     obstacles: CloudObstacles
     grasped: GraspedObject | None
     part: ConvexPart | None
@@ -43,6 +44,9 @@ class CloudWorld(CollisionWorld):
     A run of waypoints in which nothing new is touched, grasped or let go has a cloud of its own,
     from its own images: what was seen earlier may have been moved since. What is grasped counts
     as a part of the tool, its shape taken from the images before and after it was lifted.
+
+    Attributes:
+        config: how images become a cloud.
     """
 
     def __init__(
@@ -68,7 +72,7 @@ class CloudWorld(CollisionWorld):
         """
         super().__init__(demonstration, robot, scene, slip_tolerance)
         self._robot, self._held = robot, scene.held
-        self._config = config or CloudConfig()
+        self.config = config or CloudConfig()
         self._collision = CollisionModel(robot, SceneSpec((), scene.held))
         self._runs_seen: dict[range, _Seen] = {}
         self._shapes: dict[range, GraspedObject | None] = {}
@@ -90,7 +94,7 @@ class CloudWorld(CollisionWorld):
             self._placed[t] = self._collision.placed(
                 {},
                 self.openings(t),
-                slip_tolerance=self.slip_tolerance,
+                slip_tolerance=self.slip_tolerance + (seen.grasped.error if seen.grasped else 0.0),
                 gripper_play=self.gripper_play(t),
                 grasped_parts=() if seen.part is None else (seen.part,),
                 cloud=seen.obstacles,
@@ -130,23 +134,28 @@ class CloudWorld(CollisionWorld):
         if grasped is None:
             others = (o for o in self._same_grasp(run) if self._own_shape(o) is not None)
             if (other := next(others, None)) is None:
-                return _Seen(CloudObstacles(self._fused(run)), None, None)
+                cloud = self._fused(run)
+                return _Seen(cloud, CloudObstacles(cloud), None, None)
             grasped = self._seen(other).grasped
             assert grasped is not None
             grasped = dataclasses.replace(grasped, waypoints=tuple(run))
-            cloud = self._fused(run, grasped)
-        else:
-            cloud = self._fused(run, grasped)
-            if run.start > 0:
-                grasped = self._down_to_support(grasped, cloud)
+        elif run.start > 0:
+            # What it stood on is seen best before it was lifted; else where it has left.
+            seen = grasped
+            if not self.phases[0].grasped:
+                seen = self._down_to_support(grasped, self._seen(self._run(0)).cloud)
+            if seen is grasped:
+                seen = self._down_to_support(grasped, self._fused(run, grasped))
+            grasped = seen
+        cloud = self._fused(run, grasped)
         T = self._collision.T_joint_tool
         points = grasped.points @ T[:3, :3].T + T[:3, 3]
         part = hull_part(_GRASPED, len(self._robot.arm_joints), points)
-        return _Seen(CloudObstacles(cloud), grasped, part)
+        return _Seen(cloud, CloudObstacles(cloud), grasped, part)
 
     def _fused(self, run: range, *grasped: GraspedObject) -> SceneCloud:
         about = self.demonstration, self._robot, self._held
-        return fuse_cloud(*about, run, self._config, grasped)
+        return fuse_cloud(*about, run, self.config, grasped)
 
     def _own_shape(self, run: range) -> GraspedObject | None:
         """What was in the grasp in a run of waypoints, as its own images show it."""
@@ -156,7 +165,7 @@ class CloudWorld(CollisionWorld):
             about = self.demonstration, self._robot, self._held
             first = self._run(0)
             before = None if first == run else first
-            self._shapes[run] = grasped_object(*about, run, before, self._config)
+            self._shapes[run] = grasped_object(*about, run, before, self.config)
         return self._shapes[run]
 
     def _same_grasp(self, run: range) -> list[range]:
@@ -175,10 +184,11 @@ class CloudWorld(CollisionWorld):
         p = grasped.points @ T[:3, :3].T + T[:3, 3]
         low, high = p.min(0) - _BESIDE, p.max(0) + _BESIDE
         beside = (cloud.points[:, :2] >= low[:2]).all(1) & (cloud.points[:, :2] <= high[:2]).all(1)
-        below = cloud.points[beside & ~cloud.behind & (cloud.points[:, 2] < p[:, 2].min()), 2]
-        if not len(below):
+        below = beside & ~cloud.behind & (cloud.points[:, 2] < p[:, 2].min())
+        if not below.any():
             return grasped
         feet = p.copy()
-        feet[:, 2] = np.percentile(below, 90)
+        feet[:, 2] = np.percentile(cloud.points[below, 2], 90)
         points = (np.concatenate([p, feet]) - T[:3, 3]) @ T[:3, :3]
-        return dataclasses.replace(grasped, points=points)
+        error = float(cloud.inflation[below].max()) - self.config.inflation
+        return dataclasses.replace(grasped, points=points, error=max(grasped.error, error))

@@ -56,12 +56,13 @@ class Hull:
         """
         return (self._normals @ p.T + self._offsets[:, None]).max(axis=0)
 
-    def near(self, p: Array, margin: float) -> NDArray[np.bool_]:
+    def near(self, p: Array, margin: float | Array) -> NDArray[np.bool_]:
         """Which points `(n, 3)` are inside the hull, its half-spaces grown by a margin [m].
 
-        The coarse axes cut off the far corners that a sharp edge's half-spaces grow.
+        There may be a margin `(n,)` for each point. The coarse axes cut off the far corners that a
+        sharp edge's half-spaces grow.
         """
         inside = self.coarse_bound(p) <= margin
         found = np.flatnonzero(inside)
-        inside[found] = self.bound(p[found]) <= margin
+        inside[found] = self.bound(p[found]) <= np.broadcast_to(margin, inside.shape)[found]
         return inside

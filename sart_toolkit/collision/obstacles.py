@@ -17,6 +17,8 @@ from sart_toolkit.poses import Array, check_array
 
 # So many points at a time are held against all faces of a part.
 _BLOCK = 256
+# Radii of balls are rounded up to steps of at least this [m], so many at most.
+_STEP, _LEVELS = 0.00025, 6
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,18 @@ class CloudObstacles:
         """
         if not len(cloud):
             raise InvalidInput("cloud: expected at least one point, got none; look at the images")
-        self._points = cloud.points
-        self._tree = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False)
-        self._inflation = cloud.config.inflation
-        self._ball = coal.Sphere(cloud.config.inflation)
+        level, radii = _levels(cloud.inflation)
+        # Points of one radius stand together, each radius with a tree of its own.
+        order = np.argsort(level, kind="stable")
+        self._points = cloud.points[order]
+        self._radii = radii[level[order]]
+        starts = np.searchsorted(level[order], np.arange(len(radii)))
+        ends = np.append(starts[1:], len(order))
+        self._trees = [
+            (cKDTree(self._points[a:b], balanced_tree=False, compact_nodes=False), a, float(r))
+            for a, b, r in zip(starts, ends, radii, strict=True)
+        ]
+        self._balls = {float(r): coal.Sphere(float(r)) for r in radii}
         self._request = coal.DistanceRequest()
         # Parts are the same only if they are one object: a gripper's move with its opening.
         self._hulls: dict[ConvexPart, Hull] = {}
@@ -58,7 +68,9 @@ class CloudObstacles:
 
     def clearances(self, p_world: Array) -> Array:
         """How far [m] points `(..., 3)` are from the balls, negative in one: `(...)`."""
-        return np.asarray(self._tree.query(p_world)[0] - self._inflation)
+        return np.asarray(
+            np.minimum.reduce([tree.query(p_world)[0] - radius for tree, _, radius in self._trees])
+        )
 
     def distance(self, part: ConvexPart, T_world_joint: Array) -> float:
         """A part's distance [m] from the ball that is nearest to it, negative where they overlap.
@@ -95,14 +107,15 @@ class CloudObstacles:
         hull = self._hull(part)
         placed = coal_transform(T_world_joint @ part.T_joint_part)
         centre = T_world_joint[:3, :3] @ hull.centre + T_world_joint[:3, 3]
-        first = int(self._tree.query(centre)[1])
+        first = self._nearest(centre)
         near = [self._separation(part, placed, first)]
         smallest = near[0][0]
         rows, p, coarse = self._candidates(hull, T_world_joint, smallest + within)
         for start in range(0, len(rows), _BLOCK):
             if coarse[start] > smallest + within:
                 break
-            bounds = hull.bound(p[start : start + _BLOCK]) - self._inflation
+            block = slice(start, start + _BLOCK)
+            bounds = hull.bound(p[block]) - self._radii[rows[block]]
             for at in np.argsort(bounds, kind="stable"):
                 if bounds[at] > smallest + within:
                     break
@@ -112,13 +125,22 @@ class CloudObstacles:
                     smallest = min(smallest, near[-1][0])
         return near
 
+    def _nearest(self, p_world: Array) -> int:
+        """The row of the point whose ball is nearest to a point `(3,)`."""
+        found = []
+        for tree, first, radius in self._trees:
+            far, row = tree.query(p_world)
+            found.append((float(far) - radius, first + int(row)))
+        return min(found)[1]
+
     def _separation(
         self, part: ConvexPart, placed: coal.Transform3s, row: int
     ) -> tuple[float, coal.DistanceResult]:
         # A result that is not new keeps the smallest distance it has seen.
         result = coal.DistanceResult()
         ball = coal.Transform3s(np.eye(3), self._points[row])
-        distance = coal.distance(self._ball, ball, part.geometry, placed, self._request, result)
+        sphere = self._balls[float(self._radii[row])]
+        distance = coal.distance(sphere, ball, part.geometry, placed, self._request, result)
         return float(distance), result
 
     def _candidates(
@@ -129,14 +151,28 @@ class CloudObstacles:
         Their rows `(m,)`, their places `(m, 3)` in the joint's frame, and a lower bound `(m,)`.
         """
         centre = T_world_joint[:3, :3] @ hull.centre + T_world_joint[:3, 3]
-        # Where balls overlap with a part `within` may be negative.
-        reach = max(hull.radius + within + self._inflation, 0.0)
-        rows = np.array(self._tree.query_ball_point(centre, reach), dtype=np.intp)
+        found = []
+        for tree, first, radius in self._trees:
+            # Where balls overlap with a part `within` may be negative.
+            reach = max(hull.radius + within + radius, 0.0)
+            found.append(first + np.array(tree.query_ball_point(centre, reach), dtype=np.intp))
+        rows = np.concatenate(found)
         p = (self._points[rows] - T_world_joint[:3, 3]) @ T_world_joint[:3, :3]
-        bounds = hull.coarse_bound(p) - self._inflation
+        bounds = hull.coarse_bound(p) - self._radii[rows]
         order = np.flatnonzero(bounds <= within)
         order = order[np.argsort(bounds[order], kind="stable")]
         return rows[order], p[order], bounds[order]
+
+
+def _levels(radii: Array) -> tuple[NDArray[np.intp], Array]:
+    """Radii `(n,)` rounded up to a few: the index of each's among them, and these `(k,)` [m]."""
+    low, high = float(radii.min()), float(radii.max())
+    step = max(_STEP, (high - low) / (_LEVELS - 1))
+    # What is a step already, but for rounding, stays.
+    level = np.ceil((radii - low) / step - 1e-9)
+    used, index = np.unique(level, return_inverse=True)
+    found = np.maximum(low + step * used, [radii[index == i].max() for i in range(len(used))])
+    return index.astype(np.intp), found
 
 
 def hull_part(name: str, joint: int, points: Array) -> ConvexPart:

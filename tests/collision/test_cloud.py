@@ -20,7 +20,12 @@ from sart_toolkit.collision.cloud import (
     surface_errors,
 )
 from sart_toolkit.collision.obstacles import CloudObstacles, hull_part
-from sart_toolkit.collision.parts import coal_transform, convex_distance, robot_parts
+from sart_toolkit.collision.parts import (
+    coal_geometry,
+    coal_transform,
+    convex_distance,
+    robot_parts,
+)
 from sart_toolkit.data.records import CameraRecord
 from sart_toolkit.errors import InvalidInput, Mismatch, UnknownName
 from sart_toolkit.poses import inverse, pose
@@ -408,7 +413,7 @@ def test_no_point_that_is_near_enough_is_missed(peg_model, within):
 
 def one_by_one(obstacles, part, T, p):
     return convex_distance(
-        obstacles._ball,
+        coal_geometry(Shape("sphere", (obstacles._radii[0],))),
         coal_transform(pose(p)),
         part.geometry,
         coal_transform(T @ part.T_joint_part),
