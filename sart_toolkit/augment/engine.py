@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import logging
 import time
@@ -52,8 +53,11 @@ class _Worker:
         """The results of attempts, one after the other, in the executor's order."""
         for attempt in self._executor.attempts(keys):
             episode = attempt.episode
-            entry = None if episode is None else self._files.write(episode)
-            yield _Result(attempt.key, entry, Rejection(attempt.outcome, attempt.detail))
+            entry = None
+            if episode is not None:
+                entry = dataclasses.replace(self._files.write(episode), seconds=attempt.seconds)
+            rejection = Rejection(attempt.outcome, attempt.detail, attempt.seconds)
+            yield _Result(attempt.key, entry, rejection)
 
     def __call__(self, key: AttemptKey) -> _Result:
         (result,) = self.results([key])
@@ -200,7 +204,7 @@ def _finish(
             "task": demonstration.task,
             "robot": demonstration.robot,
             "seconds": seconds,
-            "simulated_seconds": attempted * config.duration,
+            "simulated_seconds": writer.executed_seconds,
             "config": config.to_json(),
             "references": dict(demonstration.references),
         }

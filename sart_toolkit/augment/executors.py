@@ -17,6 +17,7 @@ from sart_toolkit.backends.interface import (
     Observation,
     SavesStates,
     SensesContacts,
+    SensesForce,
     require,
 )
 from sart_toolkit.collision.certificate import Certificate
@@ -41,12 +42,14 @@ class Attempt:
     """The outcome of an attempt: the episode, or the reason why it was rejected.
 
     `outcome` is the same for all attempts that fail alike; `detail` gives this one's figures.
+    `seconds`: for how long [s] the robot moved, on its own clock; 0 for what was never executed.
     """
 
     key: AttemptKey
     outcome: str
     episode: Episode | None
     detail: str = ""
+    seconds: float = 0.0
 
 
 class SegmentExecutor(abc.ABC):
@@ -68,6 +71,8 @@ class SegmentExecutor(abc.ABC):
         """Make attempts on `backend`, the robot in the demonstrations' scene."""
         self._backend, self._sources, self._config = backend, sources, config
         self._planners: dict[int, SegmentPlanner] = {}
+        # Control periods that the attempt at hand has executed.
+        self._periods = 0
 
     @classmethod
     def check(
@@ -150,15 +155,17 @@ class RestoreExecutor(SegmentExecutor):
         demonstration = self._sources[key.source][0]
         proposal, rng = planner.proposal(key.sphere, key.k)
         t_star = proposal.t_star
+        self._periods = 0
         try:
             motion, certificate = planner.plan(proposal, rng)
             recorder, joint_path = self._execute(planner, motion, demonstration, t_star)
             proof = self._proof(planner, motion, certificate, joint_path, t_star)
         except Unreachable as error:
-            return Attempt(key, "out of reach", None, str(error))
+            return Attempt(key, "out of reach", None, str(error), self._seconds)
         except MotionRejected as error:
             # What stands behind the colon differs each time.
-            return Attempt(key, str(error).partition(":")[0], None, str(error))
+            outcome = str(error).partition(":")[0]
+            return Attempt(key, outcome, None, str(error), self._seconds)
         provenance = Provenance(
             demonstration_hash=self._sources[key.source][1].demonstration_hash,
             source=key.source,
@@ -171,8 +178,12 @@ class RestoreExecutor(SegmentExecutor):
             distribution=self._config.sampling.distribution,
             certificate=proof,
         )
-        steps = recorder.steps(slice(None, None, -1))
-        return Attempt(key, KEPT, Episode(steps, provenance, joint_path))
+        steps = recorder.steps(backwards=True)
+        return Attempt(key, KEPT, Episode(steps, provenance, joint_path), seconds=self._seconds)
+
+    @property
+    def _seconds(self) -> float:
+        return self._periods / self._backend.rates.control_hz
 
     def _execute(
         self, planner: SegmentPlanner, motion: Motion, demonstration: Demonstration, t_star: int
@@ -192,6 +203,8 @@ class RestoreExecutor(SegmentExecutor):
         start = recorded = backend.observe()
         measured = [start.q[None]]
         times = motion.times(rates.control_hz)
+        no_force = 0.0 if isinstance(backend, SensesForce) else np.nan
+        pressed = no_force
         for i, (time, q) in enumerate(zip(times, motion.joints(times), strict=True), 1):
             # As a policy will be at its own rate, held to what was measured a recorded step ago.
             controller.follow(q, motion.T_world_tool(time), recorded.T_world_tool)
@@ -199,12 +212,16 @@ class RestoreExecutor(SegmentExecutor):
             if not np.array_equal(sent.q, q) or sent.gripper != gripper:
                 raise MotionRejected("command cut short: the robot can't go so fast")
             backend.step()
+            self._periods += 1
+            if isinstance(backend, SensesForce):
+                pressed = max(pressed, backend.force())
             if isinstance(backend, SensesContacts):
                 check_untouched(backend.scene, backend.contacts(), grasped)
             if i % rates.control_per_record:
                 seen = backend.observe()
             else:
-                seen = recorded = recorder.add(controller, gripper, 0.0)
+                seen = recorded = recorder.add(controller, gripper, pressed)
+                pressed = no_force
             measured.append(seen.joint_path if len(seen.joint_path) else seen.q[None])
         check_undisturbed(backend.scene, grasped, start, recorded, self._config.slip_tolerance)
         return recorder, np.concatenate(measured)

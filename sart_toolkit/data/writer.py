@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -202,6 +203,14 @@ class DatasetWriter:
     def n_rejected(self) -> int:
         """How many attempts gave no episode so far."""
         return len(self._manifest.rejected)
+
+    @property
+    def executed_seconds(self) -> float | None:
+        """For how long [s] the robot moved in all attempts so far; `None` if one doesn't tell."""
+        attempts = (*self._manifest.kept.values(), *self._manifest.rejected.values())
+        seconds = [attempt.seconds for attempt in attempts if attempt.seconds is not None]
+        # In whatever order they came, the exact sum, rounded once.
+        return math.fsum(seconds) if len(seconds) == len(attempts) else None
 
     @property
     def rejections(self) -> dict[str, int]:

@@ -64,7 +64,7 @@ def test_what_is_missing_are_the_first_attempts_that_could_do(source_of, episode
         assert writer.missing(0, 1, 1, 9) == writer.missing(0, 1, 0, 9) == []
         assert writer.missing(0, 0, 2, 9) == [AttemptKey(0, 0, 0), AttemptKey(0, 0, 1)]
         assert (writer.n_kept, writer.n_rejected) == (1, 1)
-        assert writer.last_rejection == ("joint jump", "detail")
+        assert writer.last_rejection == Rejection("joint jump", "detail")
 
 
 @pytest.mark.parametrize("after", [0, 1, 7, 11, 12])
