@@ -342,7 +342,7 @@ class TeleopSession:
             raise InvalidInput(
                 "say_reached: this backend itself decides whether the goal is reached"
             )
-        held = min(len(self._success), max(1, round(self.task.hold * self._record_hz)))
+        held = min(len(self._success), self.task.steps_held(self._record_hz))
         self._success[-held:] = [True] * held
         self.judged_by = "person"
 

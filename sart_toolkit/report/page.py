@@ -462,6 +462,7 @@ def _videos(run: _Run) -> Shown | str:
                 "src": _data_uri("video/mp4", content),
                 "episode": row.get("episode", "?"),
                 "outcome": str(row.get("outcome", "")),
+                "evaluated_outcome": row.get("evaluated_outcome"),
             }
         )
     return {"videos": videos, "left_out": left_out}
