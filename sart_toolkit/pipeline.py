@@ -164,12 +164,20 @@ def backend_maker(
 ) -> BackendFactory:
     """Makes the backend of a recording or skill with its robot in its scene; picklable.
 
+    Both look as they did when the recording was made.
+
     Raises:
         UnknownName: the robot, the task or the backend can't be found.
+        InvalidInput: the appearance that the recording notes is none.
     """
-    scene = task_of(source, task).scene
+    spec, scene = robot_of(source, robot), task_of(source, task).scene
     made = _find(source, "backend", backend, get_backend)
-    return functools.partial(make_backend, made, robot_of(source, robot), scene, image_size, rates)
+    if isinstance(source, Demonstration) and "appearance" in source.task_parameters:
+        from sart_toolkit.scenes.appearance import Appearance
+
+        appearance = Appearance.from_json(source.task_parameters["appearance"])
+        spec, scene = appearance.applied(spec, scene)
+    return functools.partial(make_backend, made, spec, scene, image_size, rates)
 
 
 def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
@@ -195,6 +203,13 @@ def _checked_size(image_size: ImageSize) -> tuple[int, int]:
     if min(size) < 16:
         raise InvalidInput(f"image_size: expected at least 16 pixels, got {image_size}")
     return size
+
+
+def _check(demonstration: Demonstration, robot: RobotSpec, name: str = "demonstration") -> None:
+    """Return if a demonstration can be learned from: `check_recording`."""
+    from sart_toolkit.record.checks import check_recording
+
+    check_recording(demonstration, robot, name=name)
 
 
 # --- the stages ---------------------------------------------------------------------------------
@@ -245,7 +260,8 @@ def record(
 
     Raises:
         UnknownName: a name or reference leads to nothing.
-        InvalidInput: options don't fit each other, or a value is not acceptable.
+        InvalidInput: options don't fit each other, a value is not acceptable, or what was recorded
+            can't be learned from (`check_recording`).
         Mismatch: the goal was not reached.
         OutputExists, CannotWrite: `out` can't be written.
     """
@@ -256,7 +272,7 @@ def record(
     check_writable(out, overwrite)
     from sart_toolkit.record.session import DeviceSetup, SessionConfig, record_demonstration
     from sart_toolkit.robots.model import RobotModel
-    from sart_toolkit.scenes.appearance import randomise_appearance
+    from sart_toolkit.scenes.appearance import Appearance
     from sart_toolkit.tasks.task import Placement
 
     found = get_task(task)
@@ -272,9 +288,10 @@ def record(
         tuple(cameras),
         max_seconds,
         references={k: v for k, v in references.items() if v is not None},
+        appearance=Appearance((seed, 1)) if vary_appearance else None,
     )
-    if vary_appearance:
-        spec, scene = randomise_appearance(spec, scene, np.random.default_rng([seed, 1]))
+    if config.appearance is not None:
+        spec, scene = config.appearance.applied(spec, scene)
     with closing(make_backend(backend, spec, scene, size)) as made:
         model = RobotModel(made.robot, made.scene.held)
         setup = DeviceSetup(
@@ -297,6 +314,7 @@ def record(
     achieved = found.achieved(demonstration.success, demonstration.rates.record_hz)
     if demonstration.judged_by == "task" and not achieved:
         raise Mismatch("the demonstration did not reach the goal; record again with another --seed")
+    _check(demonstration, made.robot)
     save_demonstration(out, demonstration)
     return demonstration
 
@@ -349,11 +367,13 @@ def suggest(
     Raises:
         MissingFile, BrokenFile: the demonstration can't be read.
         UnknownName: task or robot can't be found.
+        InvalidInput: it can't be learned from (`check_recording`).
         OutputExists, CannotWrite: `out` can't be written.
     """
     check_names(task=task, robot=robot)
     demonstration = load_demonstration(demo)
     check_writable(out, overwrite)
+    _check(demonstration, robot_of(demonstration, robot), str(demo))
     from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
 
     config = SuggestConfig(**options)
@@ -401,6 +421,7 @@ def augment(
     """
     check_names(task=task, robot=robot, backend=backend, strategy=options.get("strategy", "sart"))
     demonstration = noted(load_demonstration(demo), task, robot, backend)
+    _check(demonstration, robot_of(demonstration, robot), str(demo))
     spheres = load_annotation(annotation)
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.engine import augment_demonstration
@@ -463,12 +484,18 @@ def train_policy(
 
     Raises:
         MissingFile, BrokenFile: the dataset can't be read.
-        UnknownName, InvalidInput: an option is not acceptable.
+        UnknownName, InvalidInput: an option is not acceptable, or a demonstration can't be learned
+            from (`check_recording`).
         OutputExists, CannotWrite: `out` can't be written.
     """
     check_names(policy=policy)
     generated = load_dataset(dataset)
     check_writable(out / "config.json", overwrite)
+    from sart_toolkit.record.checks import check_recording
+
+    for source in generated.sources:
+        # Its robot's limits were compared when the dataset was made; here it need not be found.
+        check_recording(source.demonstration, name=str(source.path))
     from sart_toolkit.learn.skill import save_skill
     from sart_toolkit.learn.training import train
 

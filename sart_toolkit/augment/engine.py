@@ -139,6 +139,8 @@ def augment_sources(
         if writer.finished is not None:
             return writer.finished
 
+        resumed = writer.n_kept + writer.n_rejected > 0
+
         def missing() -> list[AttemptKey]:
             """The attempts still needed, no more than can all be kept."""
             keys: list[AttemptKey] = []
@@ -157,7 +159,9 @@ def augment_sources(
                         writer.keep(entry)
                     if progress is not None:
                         progress(writer.n_kept, sum(quotas), writer.n_rejected)
-        return _finish(writer, sources[0][0], config, sum(quotas), time.perf_counter() - started)
+        # How long an interrupted generation took in all is not known.
+        seconds = None if resumed else time.perf_counter() - started
+        return _finish(writer, sources[0][0], config, sum(quotas), seconds)
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
@@ -187,7 +191,7 @@ def _finish(
     demonstration: Demonstration,
     config: AugmentConfig,
     wanted: int,
-    seconds: float,
+    seconds: float | None,
 ) -> Dataset:
     attempted = writer.n_kept + writer.n_rejected
     reasons = ", ".join(f"{reason}: {count}" for reason, count in writer.rejections.items())

@@ -45,7 +45,10 @@ def annotate_verb(args: Annotate) -> dict[str, Any]:
         # Not before the demonstration is read: these imports take a second.
         from sart_toolkit.annotate.session import AnnotateConfig, AnnotationSession
         from sart_toolkit.annotate.suggest import SuggestConfig
+        from sart_toolkit.record.checks import check_recording
 
+        robot = pipeline.robot_of(demonstration, args.robot)
+        check_recording(demonstration, robot, name=str(args.demo))
         config = AnnotateConfig(
             SuggestConfig(
                 margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius

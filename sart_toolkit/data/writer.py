@@ -268,7 +268,7 @@ class DatasetWriter:
                 for source in range(len(self.sources))
                 for sphere in range(len(self.sources[source].annotation.spheres))
             ],
-            "least_clearance_m": min(clearances, default=None),
+            "least_commanded_clearance_m": min(clearances, default=None),
             "content_hash": manifest.content_hash(),
             "versions": library_versions(),
         }

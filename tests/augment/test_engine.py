@@ -660,6 +660,12 @@ def test_a_finished_dataset_is_returned_without_another_attempt(
     assert again.info["seconds"] > 0
 
 
+def test_how_long_an_interrupted_generation_took_is_not_claimed(crowded, augment, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        augment(crowded, tmp_path / "d", progress=Interrupt(3))
+    assert augment(crowded, tmp_path / "d").info["seconds"] is None
+
+
 # --- several demonstrations ---------------------------------------------------------------------
 
 

@@ -114,6 +114,9 @@ def test_info_tells_each_kind_of_file(chain: Path, capsys: pytest.CaptureFixture
     }
     for name, kind in kinds.items():
         assert run(capsys, "info", chain / name)["kind"] == kind
+    said = run(capsys, "info", chain / "demo.h5")
+    assert "seconds_spent" not in said, "no person spent any"
+    assert said["success"] is True and said["goal_held_seconds"] >= 1.0
     main(["info", str(chain / "demo.h5")])
     assert "peg_in_hole" in capsys.readouterr().out
     assert "no run, skill or dataset" in error(capsys, "info", chain)
@@ -143,7 +146,10 @@ def test_validate_proves_a_dataset_again_and_names_what_does_not_hold(
 ) -> None:
     found = run(capsys, "validate", chain / "data")
     assert found["episodes"] == 4
-    assert 0 < found["least_clearance_mm"] < 100
+    assert 0 < found["least_measured_clearance_mm"] < 100
+    assert 0.2 <= found["least_commanded_clearance_mm"] < 100
+    stated = run(capsys, "info", chain / "data")["least_commanded_clearance_mm"]
+    assert found["least_commanded_clearance_mm"] == pytest.approx(stated, abs=0.011)
     assert 0 < found["largest_deviation_mm"] < 5
     broken = shutil.copytree(chain / "data", tmp_path / "data")
     episode = sorted(broken.glob("episodes/*/*.h5"))[0]

@@ -51,7 +51,7 @@ def test_a_finished_dataset_says_how_its_attempts_ended(carry_out, tmp_path):
     assert info["by_sphere"] == [
         {"source": 0, "waypoint": t, "kept": N, "rejections": {"joint jump": 1}} for t in (0, 2)
     ]
-    assert info["least_clearance_m"] == 0.001 and info["task"] == "nothing"
+    assert info["least_commanded_clearance_m"] == 0.001 and info["task"] == "nothing"
 
 
 def test_what_is_missing_are_the_first_attempts_that_could_do(source_of, episode_of, tmp_path):
