@@ -132,9 +132,17 @@ class RestoreExecutor(SegmentExecutor):
             UnknownName: the backend has no such camera.
             MissingCapability: the backend can't restore states, or images are wanted and it
                 takes none.
-            Mismatch: a demonstration holds no saved states, or was recorded at other rates.
+            Mismatch: a demonstration holds no saved states, or those of another backend, or was
+                recorded at other rates.
         """
         require(backend, SavesStates, _FROM_STATES)
+        for demonstration in demonstrations:
+            if demonstration.states and backend.name != demonstration.backend:
+                raise Mismatch(
+                    f"backend {backend.name!r}: can't restore the states that backend "
+                    f"{demonstration.backend!r} has saved with the demonstration; augment on "
+                    f"{demonstration.backend!r}, or record a demonstration on {backend.name!r}"
+                )
         super().check(backend, demonstrations, config)
         if not all(demonstration.states for demonstration in demonstrations):
             raise Mismatch(
