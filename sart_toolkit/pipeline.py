@@ -50,6 +50,7 @@ from sart_toolkit.robots.spec import check_image_size
 from sart_toolkit.tasks import TASKS, get_task
 
 if TYPE_CHECKING:
+    from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
     from sart_toolkit.backends.interface import Backend, BackendFactory
@@ -428,11 +429,33 @@ def augment(
 
     config = AugmentConfig(**options)
     size, rates = image_size_of(demonstration), demonstration.rates
+    _warn_of_unproved(demonstration, spheres, config, task, robot)
     make = backend_maker(demonstration, size, rates, task, robot, backend)
     return augment_demonstration(
         demonstration, spheres, make, out, config, workers, overwrite,
         lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
     )  # fmt: skip
+
+
+def _warn_of_unproved(
+    demonstration: Demonstration,
+    annotation: Annotation,
+    config: AugmentConfig,
+    task: TaskLike | None,
+    robot: RobotLike | None,
+) -> None:
+    """Name the spheres whose radius no certificate backs; segments from them may be rejected."""
+    from sart_toolkit.annotate.verdict import needs_verdict, unproved_spheres
+
+    annotation.check_matches(demonstration)
+    if not any(map(needs_verdict, annotation.spheres)):
+        return
+    world = world_of(
+        demonstration, config.obstacles, slip_tolerance=config.slip_tolerance, task=task,
+        robot=robot,
+    )  # fmt: skip
+    for sphere in unproved_spheres(annotation, world, config.margin):
+        _log.warning("sphere not proved clear: %s; segments from it may be rejected", sphere)
 
 
 def validate(

@@ -90,12 +90,17 @@ def annotate_verb(args: Annotate) -> dict[str, Any]:
             _check_done(session)
         else:
             _window_mode(session)
+    doubtful = [] if session.dirty else session.unproved
+    for sphere in [] if args.text else doubtful:
+        # In the text mode saving has said so.
+        say(f"sart: warning: not proved clear: {sphere}; segments from it may be rejected")
     if session.dirty and not session.done:
         say(f"not saved: type the same command again to resume ({journal_path} keeps it)")
     return {
         "annotation": str(out) if out.exists() else None,
         "saved": not session.dirty,
         "spheres": describe_spheres(load_annotation(out)) if out.exists() else [],
+        "not_proved_clear": doubtful,
         "presses": session.presses,
         "seconds_spent": round(session.seconds, 1),
     }

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from sart_toolkit import pipeline
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.cli import main
 from sart_toolkit.data.records import Demonstration, Steps
-from sart_toolkit.data.storage import save_demonstration
+from sart_toolkit.data.storage import save_annotation, save_demonstration
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import pose
 from sart_toolkit.record.checks import CheckConfig, check_recording, inspect_recording
@@ -200,6 +202,35 @@ def test_every_stage_that_reads_a_recording_refuses_one_that_lacks_frames(
     assert not out.exists()
     main(["info", str(demo)])
     assert "12 frames are missing" in capsys.readouterr().out
+
+
+def test_a_demonstration_without_cameras_is_refused_by_name_wherever_images_are_needed(
+    peg_demonstration, peg_annotation, make_peg_backend, tmp_path, capsys
+):
+    blind = with_steps(peg_demonstration, cameras={})
+    demo, spheres, out = (tmp_path / name for name in ("blind.h5", "a.json", "out.mp4"))
+    save_demonstration(demo, blind)
+    annotation = dataclasses.replace(peg_annotation, demonstration_hash=blind.content_hash())
+    save_annotation(spheres, annotation)
+    data = augment_demonstration(
+        blind, annotation, make_peg_backend, tmp_path / "data", AugmentConfig(n=2)
+    )
+    for argv, message in (
+        (["suggest", demo, "--source", "cloud", "--out", out], "record it with one"),
+        (["augment", demo, spheres, "--out", out], "holds no images; record it with a camera"),
+        (["play", demo, "--out", out], "holds no images; record it with a camera"),
+        (
+            ["play", data.path / data.index[0].name, "--out", out],
+            "holds no images; record it with a camera",
+        ),
+        (["train", data.path, "--out", out], "holds no images; record one with a camera"),
+    ):
+        with pytest.raises(SystemExit) as exit_:
+            main([str(word) for word in argv])
+        assert exit_.value.code == 2 and message in capsys.readouterr().err
+    assert not out.exists() or not any(out.iterdir())
+    main(["info", str(demo)])
+    assert "cameras            none" in capsys.readouterr().out
 
 
 def test_what_is_recorded_is_checked_before_it_is_saved(tmp_path, monkeypatch, gapped):
