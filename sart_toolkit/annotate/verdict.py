@@ -101,6 +101,4 @@ def unproved_spheres(annotation: Annotation, world: CollisionWorld, margin: floa
 
 def needs_verdict(sphere: PrecisionSphere) -> bool:
     """Whether a sphere's own fields don't say that its radius is backed by a certificate."""
-    return (
-        sphere.source == "human" or sphere.clearance is None or sphere.radius > sphere.clearance
-    )
+    return sphere.source == "human" or sphere.clearance is None or sphere.radius > sphere.clearance

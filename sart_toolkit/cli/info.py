@@ -55,7 +55,9 @@ def info_verb(args: Info) -> dict[str, Any]:
     return {"kind": "episode", "steps": len(recording), **plain(recording.provenance)}
 
 
-def describe_demonstration(demonstration: Demonstration, task: Task | None = None) -> dict[str, Any]:
+def describe_demonstration(
+    demonstration: Demonstration, task: Task | None = None
+) -> dict[str, Any]:
     """A demonstration in a few words; whether it succeeded, where its task is one of ours or given.
 
     A file may name any code as its task, which is not to run only to look at the file.

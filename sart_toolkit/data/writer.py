@@ -207,10 +207,11 @@ class DatasetWriter:
     @property
     def executed_seconds(self) -> float | None:
         """For how long [s] the robot moved in all attempts so far; `None` if one doesn't tell."""
-        attempts = (*self._manifest.kept.values(), *self._manifest.rejected.values())
-        seconds = [attempt.seconds for attempt in attempts if attempt.seconds is not None]
+        seconds = [entry.seconds for entry in self._manifest.kept.values()]
+        seconds += [rejection.seconds for rejection in self._manifest.rejected.values()]
+        told = [value for value in seconds if value is not None]
         # In whatever order they came, the exact sum, rounded once.
-        return math.fsum(seconds) if len(seconds) == len(attempts) else None
+        return math.fsum(told) if len(told) == len(seconds) else None
 
     @property
     def rejections(self) -> dict[str, int]:

@@ -166,7 +166,7 @@ def _jumps(demonstration: Demonstration, robot: RobotSpec | None, config: CheckC
         moved = np.abs(np.diff(steps.joint_positions, axis=0))
         over = moved / most
         if over.max() > config.over_limit:
-            t, joint = np.unravel_index(int(over.argmax()), over.shape)
+            t, joint = divmod(int(over.argmax()), over.shape[1])
             problems.append(
                 f"joint {robot.arm_joints[joint]} moves by {moved[t, joint]:.2f} rad between "
                 f"t={times[t]:.1f} s and {times[t + 1]:.1f} s, by its limit it can by "

@@ -40,7 +40,7 @@ class AppearanceConfig:
 
 @dataclass(frozen=True)
 class Appearance:
-    """A random appearance that can be drawn again: the seed of its generator, and how far it varies.
+    """A random appearance that can be drawn again: its generator's seed, and how far it varies.
 
     A recording keeps it as JSON, so that robot and scene look the same whenever they are made again
     for it.

@@ -756,9 +756,15 @@ def test_an_unknown_executor_is_refused_with_the_nearest_name(annotate, augment,
 
 @pytest.mark.parametrize("finished", [True, False])
 def test_a_directory_made_with_other_settings_is_left_alone_unless_overwritten(
-    annotate, augment, tmp_path, finished
+    annotate, augment, peg_demonstration, make_peg_backend, tmp_path, finished
 ):
     annotation, out = annotate((0, 0.03)), tmp_path / "d"
+
+    def larger():
+        backend = make_peg_backend()
+        backend.image_size = (64, 64)
+        return backend
+
     config = AugmentConfig(n=3, duration=0.8)
     if finished:
         augment(annotation, out, config)
@@ -774,6 +780,10 @@ def test_a_directory_made_with_other_settings_is_left_alone_unless_overwritten(
         (
             lambda: augment(annotation, out, dataclasses.replace(config, seed=1)),
             r"request.config.seed 0, now 1\)",
+        ),
+        (
+            lambda: augment_demonstration(peg_demonstration, annotation, larger, out, config),
+            r"request.image_size.0 48, now 64, request.image_size.1 48, now 64\)",
         ),
         (lambda: augment(annotate((0, 0.031)), out, config), r"sources.0.annotation .*, now .*\)"),
     ):

@@ -385,9 +385,7 @@ def test_what_was_recorded_with_varied_appearance_is_augmented_alike_and_trained
     # A corner that shows the table throughout.
     colours = [images.rgb[:, -1, 0].mean(0) for images in (recorded, episode)]
     np.testing.assert_allclose(colours[0], colours[1], atol=6)
-    said = run(
-        capsys, "train", data, "--out", tmp_path / "skill", "--epochs", 1, "--device", "cpu"
-    )
+    said = run(capsys, "train", data, "--out", tmp_path / "skill", "--epochs", 1, "--device", "cpu")
     assert said["trajectories"] == 4
 
 

@@ -294,9 +294,7 @@ def test_the_first_failures_are_handed_to_the_film_maker(evaluate, short_task, t
         assert moments[0].overview.shape != moments[0].wrist.shape
 
 
-def test_a_video_carries_the_outcome_of_the_run_that_it_shows(
-    evaluate, replay, tmp_path, caplog
-):
+def test_a_video_carries_the_outcome_of_the_run_that_it_shows(evaluate, replay, tmp_path, caplog):
     """The policy fails when it is evaluated, and succeeds when it is run again."""
 
     class Improving(Player):

@@ -72,14 +72,14 @@ def test_dropped_frames_are_refused_with_their_number_place_and_the_action_they_
     commanded = gapped.steps.commanded_Ts_world_tool[:, :3, 3]
     far = 1e3 * np.linalg.norm(commanded[8] - commanded[7])
     assert far > 60
-    expected = rf"12 frames are missing between t=0\.7 s and 2\.0 s; an action of {far:.0f} mm would"
+    expected = (
+        rf"12 frames are missing between t=0\.7 s and 2\.0 s; an action of {far:.0f} mm would"
+    )
     with pytest.raises(InvalidInput, match=expected):
         check_recording(gapped, robot)
 
 
-def test_dropped_frames_are_found_by_the_jump_where_time_was_written_anew(
-    peg_demonstration, robot
-):
+def test_dropped_frames_are_found_by_the_jump_where_time_was_written_anew(peg_demonstration, robot):
     n = len(peg_demonstration)
     rows = [t for t in range(n) if not 8 <= t < 20]
     found = inspect_recording(with_rows(peg_demonstration, rows, retimed=True), robot)
@@ -129,23 +129,22 @@ def test_a_recording_too_short_to_rejoin_is_refused(peg_demonstration, robot, n)
 def test_a_recording_in_which_nothing_moves_is_refused(peg_demonstration, robot):
     still = with_rows(peg_demonstration, [0] * 30, retimed=True)
     with pytest.raises(
-        InvalidInput, match=r"nothing moves: for 30 steps the tool stays within 0\.0 mm and 0\.0 deg"
+        InvalidInput,
+        match=r"nothing moves: for 30 steps the tool stays within 0\.0 mm and 0\.0 deg",
     ):
         check_recording(still, robot)
 
 
-@pytest.mark.parametrize(
-    ("at", "where"), [(0, ", at its start"), (20, ""), (-1, ", at its end")]
-)
-def test_idle_frames_are_warned_of_with_their_number_and_place(
-    peg_demonstration, robot, at, where
-):
+@pytest.mark.parametrize(("at", "where"), [(0, ", at its start"), (20, ""), (-1, ", at its end")])
+def test_idle_frames_are_warned_of_with_their_number_and_place(peg_demonstration, robot, at, where):
     at = at % len(peg_demonstration)
     rows = [*range(at), *[at] * 31, *range(at + 1, len(peg_demonstration))]
     found = inspect_recording(with_rows(peg_demonstration, rows, np.empty((0, 7)), True), robot)
     assert found.problems == ()
     (warning,) = found.warnings
-    match = re.fullmatch(r"stands still for (\d+) steps, (\d\.\d) s, from t=(\d\.\d) s(.*)", warning)
+    match = re.fullmatch(
+        r"stands still for (\d+) steps, (\d\.\d) s, from t=(\d\.\d) s(.*)", warning
+    )
     assert match is not None and match[4] == where
     assert 30 <= int(match[1]) <= 45 and float(match[2]) == int(match[1]) / 10
 
@@ -166,9 +165,7 @@ def test_an_action_that_no_rollout_can_follow_is_warned_of_and_a_jump_refused(
     def shifted(by):
         Ts = np.array(peg_demonstration.steps.commanded_Ts_world_tool)
         Ts[20:] = pose([0, 0, by]) @ Ts[20:]
-        return inspect_recording(
-            with_steps(peg_demonstration, commanded_Ts_world_tool=Ts), robot
-        )
+        return inspect_recording(with_steps(peg_demonstration, commanded_Ts_world_tool=Ts), robot)
 
     assert shifted(0.005).warnings == ()
     (warning,) = shifted(0.04).warnings
@@ -185,9 +182,7 @@ def test_a_bad_threshold_is_refused():
 # --- where it is checked ------------------------------------------------------------------------
 
 
-def test_every_stage_that_reads_a_recording_refuses_one_that_lacks_frames(
-    gapped, tmp_path, capsys
-):
+def test_every_stage_that_reads_a_recording_refuses_one_that_lacks_frames(gapped, tmp_path, capsys):
     demo, out = tmp_path / "gapped.h5", tmp_path / "out"
     save_demonstration(demo, gapped)
     for stage in (
@@ -234,15 +229,15 @@ def test_a_demonstration_without_cameras_is_refused_by_name_wherever_images_are_
 
 
 def test_what_is_recorded_is_checked_before_it_is_saved(tmp_path, monkeypatch, gapped):
-    monkeypatch.setattr(
-        "sart_toolkit.record.session.record_demonstration", lambda *_, **__: gapped
-    )
+    monkeypatch.setattr("sart_toolkit.record.session.record_demonstration", lambda *_, **__: gapped)
     with pytest.raises(InvalidInput, match="12 frames are missing"):
         pipeline.record("peg_in_hole", tmp_path / "d.h5", image_size=32)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_dataset_of_a_faulty_recording_is_not_trained_on(peg_dataset, monkeypatch, tmp_path, gapped):
+def test_a_dataset_of_a_faulty_recording_is_not_trained_on(
+    peg_dataset, monkeypatch, tmp_path, gapped
+):
     monkeypatch.setattr(
         "sart_toolkit.data.dataset.Source.demonstration", property(lambda self: gapped)
     )
