@@ -42,14 +42,15 @@ class Attempt:
     """The outcome of an attempt: the episode, or the reason why it was rejected.
 
     `outcome` is the same for all attempts that fail alike; `detail` gives this one's figures.
-    `seconds`: for how long [s] the robot moved, on its own clock; 0 for what was never executed.
+    `seconds`: for how long [s] the robot moved, on its own clock; 0 for what was never executed,
+    `None` where the executor doesn't tell.
     """
 
     key: AttemptKey
     outcome: str
     episode: Episode | None
     detail: str = ""
-    seconds: float = 0.0
+    seconds: float | None = None
 
 
 class SegmentExecutor(abc.ABC):
