@@ -457,7 +457,7 @@ class TeleopSession:
         for step, pause in self._pauses:
             times[step:] -= pause
         # Where a clock counts periods, its rounding errors are not to show.
-        return np.round(times - times[0], 6)
+        return np.round(times - times[0], 9)
 
     def demonstration(
         self, operator: str, device: str, seconds: float, seed: int | None = None
