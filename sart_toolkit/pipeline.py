@@ -52,6 +52,7 @@ from sart_toolkit.robots.spec import check_image_size
 from sart_toolkit.tasks import TASKS, get_task
 
 if TYPE_CHECKING:
+    from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
     from sart_toolkit.backends.interface import Backend, BackendFactory
@@ -167,12 +168,20 @@ def backend_maker(
 ) -> BackendFactory:
     """Makes the backend of a recording or skill with its robot in its scene; picklable.
 
+    Both look as they did when the recording was made.
+
     Raises:
         UnknownName: the robot, the task or the backend can't be found.
+        InvalidInput: the appearance that the recording notes is none.
     """
-    scene = task_of(source, task).scene
+    spec, scene = robot_of(source, robot), task_of(source, task).scene
     made = _find(source, "backend", backend, get_backend)
-    return functools.partial(make_backend, made, robot_of(source, robot), scene, image_size, rates)
+    if isinstance(source, Demonstration) and "appearance" in source.task_parameters:
+        from sart_toolkit.scenes.appearance import Appearance
+
+        appearance = Appearance.from_json(source.task_parameters["appearance"])
+        spec, scene = appearance.applied(spec, scene)
+    return functools.partial(make_backend, made, spec, scene, image_size, rates)
 
 
 def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
@@ -198,6 +207,13 @@ def _checked_size(image_size: ImageSize) -> tuple[int, int]:
     if min(size) < 16:
         raise InvalidInput(f"image_size: expected at least 16 pixels, got {image_size}")
     return size
+
+
+def _check(demonstration: Demonstration, robot: RobotSpec, name: str = "demonstration") -> None:
+    """Return if a demonstration can be learned from: `check_recording`."""
+    from sart_toolkit.record.checks import check_recording
+
+    check_recording(demonstration, robot, name=name)
 
 
 # --- the stages ---------------------------------------------------------------------------------
@@ -264,7 +280,8 @@ def record(
 
     Raises:
         UnknownName: a name or reference leads to nothing.
-        InvalidInput: options don't fit each other, or a value is not acceptable.
+        InvalidInput: options don't fit each other, a value is not acceptable, or what was recorded
+            can't be learned from (`check_recording`).
         Mismatch: the goal was not reached.
         OutputExists, CannotWrite: `out` can't be written.
     """
@@ -275,7 +292,7 @@ def record(
     check_writable(out, overwrite)
     from sart_toolkit.record.session import DeviceSetup, SessionConfig, record_demonstration
     from sart_toolkit.robots.model import RobotModel
-    from sart_toolkit.scenes.appearance import randomise_appearance
+    from sart_toolkit.scenes.appearance import Appearance
     from sart_toolkit.tasks.task import Placement
 
     found = get_task(task)
@@ -291,9 +308,10 @@ def record(
         tuple(cameras),
         max_seconds,
         references={k: v for k, v in references.items() if v is not None},
+        appearance=Appearance((seed, 1)) if vary_appearance else None,
     )
-    if vary_appearance:
-        spec, scene = randomise_appearance(spec, scene, np.random.default_rng([seed, 1]))
+    if config.appearance is not None:
+        spec, scene = config.appearance.applied(spec, scene)
     with closing(make_backend(backend, spec, scene, size)) as made:
         model = RobotModel(made.robot, made.scene.held)
         setup = DeviceSetup(
@@ -316,6 +334,7 @@ def record(
     achieved = found.achieved(demonstration.success, demonstration.rates.record_hz)
     if demonstration.judged_by == "task" and not achieved:
         raise Mismatch("the demonstration did not reach the goal; record again with another --seed")
+    _check(demonstration, made.robot)
     save_demonstration(out, demonstration)
     return demonstration
 
@@ -376,11 +395,13 @@ def suggest(
     Raises:
         MissingFile, BrokenFile: the demonstration can't be read.
         UnknownName: task or robot can't be found.
+        InvalidInput: it can't be learned from (`check_recording`).
         OutputExists, CannotWrite: `out` can't be written.
     """
     check_names(task=task, robot=robot)
     demonstration = load_demonstration(demo)
     check_writable(out, overwrite)
+    _check(demonstration, robot_of(demonstration, robot), str(demo))
     from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
 
     config = SuggestConfig(**options)
@@ -431,6 +452,7 @@ def augment(
     """
     check_names(task=task, robot=robot, backend=backend, strategy=options.get("strategy", "sart"))
     demonstration = noted(load_demonstration(demo), task, robot, backend)
+    _check(demonstration, robot_of(demonstration, robot), str(demo))
     spheres = load_annotation(annotation)
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.engine import augment_demonstration
@@ -440,6 +462,7 @@ def augment(
         options["cloud"] = _cloud_of(spheres, sensor)
     config = AugmentConfig(**options)
     size, rates = image_size_of(demonstration), demonstration.rates
+    _warn_of_unproved(demonstration, spheres, config, task, robot)
     make = backend_maker(demonstration, size, rates, task, robot, backend)
     return augment_demonstration(
         demonstration, spheres, make, out, config, workers, overwrite,
@@ -460,6 +483,28 @@ def _cloud_of(annotation: Annotation, sensor: SensorErrors | None) -> CloudConfi
     settings = annotation.settings.get("cloud")
     cloud = CloudConfig() if settings is None else CloudConfig.from_json(settings)
     return cloud if sensor is None else dataclasses.replace(cloud, sensor=sensor)
+
+
+def _warn_of_unproved(
+    demonstration: Demonstration,
+    annotation: Annotation,
+    config: AugmentConfig,
+    task: TaskLike | None,
+    robot: RobotLike | None,
+) -> None:
+    """Name the spheres whose radius no certificate backs; segments from them may be rejected."""
+    from sart_toolkit.annotate.verdict import needs_verdict, unproved_spheres
+
+    annotation.check_matches(demonstration)
+    if not any(map(needs_verdict, annotation.spheres)):
+        return
+    world = world_of(
+        demonstration, config.obstacles, slip_tolerance=config.slip_tolerance, task=task,
+        robot=robot, unknown=config.cloud.unknown,
+        sensor=config.cloud.sensor if config.obstacles == "cloud" else None,
+    )  # fmt: skip
+    for sphere in unproved_spheres(annotation, world, config.margin):
+        _log.warning("sphere not proved clear: %s; segments from it may be rejected", sphere)
 
 
 def validate(
@@ -512,12 +557,18 @@ def train_policy(
 
     Raises:
         MissingFile, BrokenFile: the dataset can't be read.
-        UnknownName, InvalidInput: an option is not acceptable.
+        UnknownName, InvalidInput: an option is not acceptable, or a demonstration can't be learned
+            from (`check_recording`).
         OutputExists, CannotWrite: `out` can't be written.
     """
     check_names(policy=policy)
     generated = load_dataset(dataset)
     check_writable(out / "config.json", overwrite)
+    from sart_toolkit.record.checks import check_recording
+
+    for source in generated.sources:
+        # Its robot's limits were compared when the dataset was made; here it need not be found.
+        check_recording(source.demonstration, name=str(source.path))
     from sart_toolkit.learn.skill import save_skill
     from sart_toolkit.learn.training import train
 

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from sart_toolkit.annotate.session import ACTIONS, AnnotationSession, Word
+from sart_toolkit.annotate.session import ACTIONS, AnnotationSession
+from sart_toolkit.annotate.verdict import Word
 from sart_toolkit.annotate.visuals import DrawnMesh, DrawnRobot, body_meshes
 from sart_toolkit.collision.cloud import CloudConfig, SceneCloud, fuse_cloud
 from sart_toolkit.data.records import Image, PrecisionSphere

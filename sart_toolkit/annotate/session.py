@@ -23,6 +23,7 @@ from sart_toolkit.annotate.suggest import (
     suggest_radius,
     suggestion_settings,
 )
+from sart_toolkit.annotate.verdict import Verdict, unproved, verdict_of
 from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import (
     Annotation,
@@ -36,9 +37,6 @@ from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, SartError, u
 from sart_toolkit.poses import Array, check_positive
 
 Spheres = tuple[PrecisionSphere, ...]
-Word = Literal["safe", "tight", "colliding", "no room", "region"]
-# Suggested radii are rounded down to whole micrometres.
-_ROUNDING = 1e-6
 _JUMP = 10
 
 
@@ -70,27 +68,6 @@ class AnnotateConfig:
             )
         if self.ghosts < 0:
             raise InvalidInput(f"ghosts: expected a whole number >= 0, got {self.ghosts}")
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What geometry says of a sphere.
-
-    `word`: "safe": the tool is proved clear at every pose that can be drawn; "tight": it is not,
-    though no pose is known to touch; "colliding": the radius is more than the distance of the
-    limiting pair; "no room": nothing may be drawn here, whatever the radius; "region": free space
-    for the planner, which itself keeps clear. `largest` [m]: the largest radius that is safe, 0
-    for none. `limited_by`: the pair, or what else limits it.
-    """
-
-    word: Word
-    largest: float
-    limited_by: str
-
-    def __str__(self) -> str:
-        if self.word in ("no room", "region"):
-            return f"{self.word}: {self.limited_by}"
-        return f"{self.word}: up to {1e3 * self.largest:.1f} mm is safe ({self.limited_by})"
 
 
 class AnnotationSession:
@@ -217,19 +194,13 @@ class AnnotationSession:
     def verdict(self, sphere: PrecisionSphere) -> Verdict:
         """What geometry says of a sphere."""
         found = self.largest_safe(sphere.waypoint)
-        room = found.clearance is not None and found.clearance > self.config.suggest.margin
-        word: Word
-        if not room:
-            word = "no room"
-        elif sphere.kind == "free_space":
-            word = "region"
-        elif sphere.radius <= found.radius + _ROUNDING:
-            word = "safe"
-        else:
-            assert found.clearance is not None
-            word = "tight" if sphere.radius <= found.clearance else "colliding"
-        reason = found.limited_by if word != "region" else "the planner keeps clear in it"
-        return Verdict(word, found.radius, reason)
+        return verdict_of(sphere, found, self.config.suggest.margin)
+
+    @property
+    def unproved(self) -> list[str]:
+        """The spheres that aren't proved clear, in words: segments from them may be rejected."""
+        verdicts = [(sphere, self.verdict(sphere)) for sphere in self.spheres]
+        return [unproved(sphere, verdict) for sphere, verdict in verdicts if not verdict.proved]
 
     @functools.cached_property
     def clearances(self) -> Array:
@@ -522,7 +493,11 @@ class AnnotationSession:
         annotation = self.annotation()
         save_annotation(self.out, annotation)
         self._saved = self.spheres
-        return f"saved {len(self.spheres)} spheres to {self.out}, {annotation.seconds:.0f} s spent"
+        said = f"saved {len(self.spheres)} spheres to {self.out}, {annotation.seconds:.0f} s spent"
+        doubtful = self.unproved
+        if doubtful:
+            said += f"; NOT proved clear: {'; '.join(doubtful)}"
+        return said
 
     def _quit(self) -> str:
         if self.dirty and not self._leaving:

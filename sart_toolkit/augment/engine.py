@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import logging
 import time
@@ -52,8 +53,11 @@ class _Worker:
         """The results of attempts, one after the other, in the executor's order."""
         for attempt in self._executor.attempts(keys):
             episode = attempt.episode
-            entry = None if episode is None else self._files.write(episode)
-            yield _Result(attempt.key, entry, Rejection(attempt.outcome, attempt.detail))
+            entry = None
+            if episode is not None:
+                entry = dataclasses.replace(self._files.write(episode), seconds=attempt.seconds)
+            rejection = Rejection(attempt.outcome, attempt.detail, attempt.seconds)
+            yield _Result(attempt.key, entry, rejection)
 
     def __call__(self, key: AttemptKey) -> _Result:
         (result,) = self.results([key])
@@ -135,6 +139,8 @@ def augment_sources(
         if writer.finished is not None:
             return writer.finished
 
+        resumed = writer.n_kept + writer.n_rejected > 0
+
         def missing() -> list[AttemptKey]:
             """The attempts still needed, no more than can all be kept."""
             keys: list[AttemptKey] = []
@@ -153,7 +159,9 @@ def augment_sources(
                         writer.keep(entry)
                     if progress is not None:
                         progress(writer.n_kept, sum(quotas), writer.n_rejected)
-        return _finish(writer, sources[0][0], config, sum(quotas), time.perf_counter() - started)
+        # How long an interrupted generation took in all is not known.
+        seconds = None if resumed else time.perf_counter() - started
+        return _finish(writer, sources[0][0], config, sum(quotas), seconds)
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
@@ -183,7 +191,7 @@ def _finish(
     demonstration: Demonstration,
     config: AugmentConfig,
     wanted: int,
-    seconds: float,
+    seconds: float | None,
 ) -> Dataset:
     attempted = writer.n_kept + writer.n_rejected
     reasons = ", ".join(f"{reason}: {count}" for reason, count in writer.rejections.items())
@@ -200,7 +208,7 @@ def _finish(
             "task": demonstration.task,
             "robot": demonstration.robot,
             "seconds": seconds,
-            "simulated_seconds": attempted * config.duration,
+            "simulated_seconds": writer.executed_seconds,
             "config": config.to_json(),
             "references": dict(demonstration.references),
         }

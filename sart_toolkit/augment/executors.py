@@ -17,6 +17,7 @@ from sart_toolkit.backends.interface import (
     Observation,
     SavesStates,
     SensesContacts,
+    SensesForce,
     require,
 )
 from sart_toolkit.collision.certificate import Certificate
@@ -41,12 +42,15 @@ class Attempt:
     """The outcome of an attempt: the episode, or the reason why it was rejected.
 
     `outcome` is the same for all attempts that fail alike; `detail` gives this one's figures.
+    `seconds`: for how long [s] the robot moved, on its own clock; 0 for what was never executed,
+    `None` where the executor doesn't tell.
     """
 
     key: AttemptKey
     outcome: str
     episode: Episode | None
     detail: str = ""
+    seconds: float | None = None
 
 
 class SegmentExecutor(abc.ABC):
@@ -68,6 +72,8 @@ class SegmentExecutor(abc.ABC):
         """Make attempts on `backend`, the robot in the demonstrations' scene."""
         self._backend, self._sources, self._config = backend, sources, config
         self._planners: dict[int, SegmentPlanner] = {}
+        # Control periods that the attempt at hand has executed.
+        self._periods = 0
 
     @property
     def tracking_error(self) -> float:
@@ -134,9 +140,17 @@ class RestoreExecutor(SegmentExecutor):
             UnknownName: the backend has no such camera.
             MissingCapability: the backend can't restore states, or images are wanted and it
                 takes none.
-            Mismatch: a demonstration holds no saved states, or was recorded at other rates.
+            Mismatch: a demonstration holds no saved states, or those of another backend, or was
+                recorded at other rates.
         """
         require(backend, SavesStates, _FROM_STATES)
+        for demonstration in demonstrations:
+            if demonstration.states and backend.name != demonstration.backend:
+                raise Mismatch(
+                    f"backend {backend.name!r}: can't restore the states that backend "
+                    f"{demonstration.backend!r} has saved with the demonstration; augment on "
+                    f"{demonstration.backend!r}, or record a demonstration on {backend.name!r}"
+                )
         super().check(backend, demonstrations, config)
         if not all(demonstration.states for demonstration in demonstrations):
             raise Mismatch(
@@ -157,15 +171,17 @@ class RestoreExecutor(SegmentExecutor):
         demonstration = self._sources[key.source][0]
         proposal, rng = planner.proposal(key.sphere, key.k)
         t_star = proposal.t_star
+        self._periods = 0
         try:
             motion, certificate = planner.plan(proposal, rng, self.tracking_error)
             recorder, joint_path = self._execute(planner, motion, demonstration, t_star)
             proof = self._proof(planner, motion, certificate, joint_path, t_star)
         except Unreachable as error:
-            return Attempt(key, "out of reach", None, str(error))
+            return Attempt(key, "out of reach", None, str(error), self._seconds)
         except MotionRejected as error:
             # What stands behind the colon differs each time.
-            return Attempt(key, str(error).partition(":")[0], None, str(error))
+            outcome = str(error).partition(":")[0]
+            return Attempt(key, outcome, None, str(error), self._seconds)
         provenance = Provenance(
             demonstration_hash=self._sources[key.source][1].demonstration_hash,
             source=key.source,
@@ -178,8 +194,12 @@ class RestoreExecutor(SegmentExecutor):
             distribution=self._config.sampling.distribution,
             certificate=proof,
         )
-        steps = recorder.steps(slice(None, None, -1))
-        return Attempt(key, KEPT, Episode(steps, provenance, joint_path))
+        steps = recorder.steps(backwards=True)
+        return Attempt(key, KEPT, Episode(steps, provenance, joint_path), seconds=self._seconds)
+
+    @property
+    def _seconds(self) -> float:
+        return self._periods / self._backend.rates.control_hz
 
     def _execute(
         self, planner: SegmentPlanner, motion: Motion, demonstration: Demonstration, t_star: int
@@ -200,11 +220,18 @@ class RestoreExecutor(SegmentExecutor):
             steps.commanded_joint_positions[t_star], steps.commanded_Ts_world_tool[t_star]
         )
 
+        no_force = 0.0 if isinstance(backend, SensesForce) else np.nan
+        pressed = no_force
+
         def send(targets: Array) -> None:
+            nonlocal pressed
             sent = backend.command(targets, gripper)
             if not np.array_equal(sent.q, targets[-1]) or sent.gripper != gripper:
                 raise MotionRejected("command cut short: the robot can't go so fast")
             backend.step()
+            self._periods += 1
+            if isinstance(backend, SensesForce):
+                pressed = max(pressed, backend.force())
             if isinstance(backend, SensesContacts):
                 check_untouched(backend.scene, backend.contacts(), grasped)
 
@@ -216,6 +243,7 @@ class RestoreExecutor(SegmentExecutor):
             recorded = backend.observe()
             disturbance(recorded)
             measured.append(joint_rows(recorded))
+        pressed = no_force
         times = motion.times(rates.control_hz)
         targets = periods(motion.joints(motion.times(rates.physics_hz)))
         for i, (time, rows) in enumerate(zip(times, targets, strict=True), 1):
@@ -225,7 +253,8 @@ class RestoreExecutor(SegmentExecutor):
             if i % rates.control_per_record:
                 seen = backend.observe()
             else:
-                seen = recorded = recorder.add(controller, gripper, 0.0)
+                seen = recorded = recorder.add(controller, gripper, pressed)
+                pressed = no_force
             disturbance(seen)
             measured.append(joint_rows(seen))
         return recorder, np.concatenate(measured)

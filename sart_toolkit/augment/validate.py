@@ -39,13 +39,15 @@ class Validation:
     """What came of checking a dataset.
 
     `episodes`: how many were checked; `problems`: what doesn't hold, by the episode's file;
-    `least_clearance` [m]: the smallest that the certificates of the commanded and
-    of the measured paths prove, `largest_deviation` [m] of the measured paths from the commanded.
+    `least_commanded_clearance`, `least_measured_clearance` [m]: the smallest that the certificates
+    of the commanded and of the measured paths prove; `largest_deviation` [m] of any point of the
+    robot on a measured path from the commanded one.
     """
 
     episodes: int
     problems: Mapping[str, str]
-    least_clearance: float
+    least_commanded_clearance: float
+    least_measured_clearance: float
     largest_deviation: float
 
 
@@ -93,7 +95,10 @@ def validate_dataset(
             problems[entry.name] = str(error)
         if progress is not None:
             progress(i + 1, len(dataset))
-    return Validation(len(dataset), problems, check.least_clearance, check.largest_deviation)
+    least = check.least_clearance
+    return Validation(
+        len(dataset), problems, least["commanded"], least["measured"], check.largest_deviation
+    )
 
 
 class _EpisodeCheck:
@@ -110,7 +115,7 @@ class _EpisodeCheck:
             )
             for i, source in enumerate(dataset.sources)
         ]
-        self.least_clearance = np.inf
+        self.least_clearance = {"commanded": np.inf, "measured": np.inf}
         self.largest_deviation = 0.0
 
     def __call__(self, entry: EpisodeEntry, episode: Episode) -> None:
@@ -172,7 +177,7 @@ class _EpisodeCheck:
                 f"certificate: the {which} path is proved {found.clearance * 1e3:.3f} mm clear, "
                 f"{claim.clearance * 1e3:.3f} mm are stated"
             )
-        self.least_clearance = min(self.least_clearance, found.clearance)
+        self.least_clearance[which] = min(self.least_clearance[which], found.clearance)
 
 
 def _stated_length(proof: Mapping[str, Any], name: str) -> float:

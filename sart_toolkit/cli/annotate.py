@@ -54,7 +54,10 @@ def _annotate(args: Annotate, out: Path, headless: bool, lock: OutputLock) -> di
         # Not before the demonstration is read: these imports take a second.
         from sart_toolkit.annotate.session import AnnotateConfig, AnnotationSession
         from sart_toolkit.annotate.suggest import SuggestConfig
+        from sart_toolkit.record.checks import check_recording
 
+        robot = pipeline.robot_of(demonstration, args.robot)
+        check_recording(demonstration, robot, name=str(args.demo))
         config = AnnotateConfig(
             SuggestConfig(
                 margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius
@@ -96,12 +99,17 @@ def _annotate(args: Annotate, out: Path, headless: bool, lock: OutputLock) -> di
             _check_done(session)
         else:
             _window_mode(session)
+    doubtful = [] if session.dirty else session.unproved
+    for sphere in [] if args.text else doubtful:
+        # In the text mode saving has said so.
+        say(f"sart: warning: not proved clear: {sphere}; segments from it may be rejected")
     if session.dirty and not session.done:
         say(f"not saved: type the same command again to resume ({journal_path} keeps it)")
     return {
         "annotation": str(out) if out.exists() else None,
         "saved": not session.dirty,
         "spheres": describe_spheres(load_annotation(out)) if out.exists() else [],
+        "not_proved_clear": doubtful,
         "presses": session.presses,
         "seconds_spent": round(session.seconds, 1),
     }

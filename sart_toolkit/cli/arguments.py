@@ -367,7 +367,7 @@ class Augment:
 
 @dataclass(frozen=True)
 class Validate:
-    """Prove a dataset's segments clear again, and check its hashes and reversals.
+    """Prove commanded and measured paths of a dataset clear again; check hashes and reversals.
 
     Example: sart validate dataset
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from sart_toolkit import pipeline
@@ -55,6 +56,13 @@ def validate_verb(args: Validate) -> dict[str, Any]:
     return {
         "dataset": str(args.dataset),
         "episodes": found.episodes,
-        "least_clearance_mm": round(found.least_clearance * 1e3, 3),
-        "largest_deviation_mm": round(found.largest_deviation * 1e3, 3),
+        "least_commanded_clearance_mm": _rounded_down(found.least_commanded_clearance),
+        "least_measured_clearance_mm": _rounded_down(found.least_measured_clearance),
+        "largest_deviation_mm": math.ceil(1e6 * found.largest_deviation - 1e-6) / 1e3,
     }
+
+
+def _rounded_down(metres: float) -> float | None:
+    """A lower bound in mm, so that it stays one; None where there is nothing that it is of."""
+    # Parts per million of a micrometre are what the conversion to mm may take away.
+    return math.floor(1e6 * metres + 1e-6) / 1e3 if math.isfinite(metres) else None

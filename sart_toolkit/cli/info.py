@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,11 @@ from sart_toolkit.data.dataset import MANIFEST, Dataset, load_dataset
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import load_annotation, load_recording, read_json
 from sart_toolkit.errors import BrokenFile, MissingFile
+from sart_toolkit.robots import ROBOTS, get_robot
+from sart_toolkit.tasks import TASKS, get_task
+
+if TYPE_CHECKING:
+    from sart_toolkit.tasks.task import Task
 
 
 def info_verb(args: Info) -> dict[str, Any]:
@@ -46,27 +51,48 @@ def info_verb(args: Info) -> dict[str, Any]:
         raise BrokenFile(f"{path}: neither an annotation nor an evaluation; pass another file")
     recording = load_recording(path)
     if isinstance(recording, Demonstration):
-        return {"kind": "demonstration", **describe_demonstration(recording)}
+        return {"kind": "demonstration", **describe_demonstration(recording), **_checked(recording)}
     return {"kind": "episode", "steps": len(recording), **plain(recording.provenance)}
 
 
-def describe_demonstration(demonstration: Demonstration) -> dict[str, Any]:
-    """A demonstration in a few words."""
+def describe_demonstration(
+    demonstration: Demonstration, task: Task | None = None
+) -> dict[str, Any]:
+    """A demonstration in a few words; whether it succeeded, where its task is one of ours or given.
+
+    A file may name any code as its task, which is not to run only to look at the file.
+    """
     d = demonstration
+    if task is None and d.task in TASKS and d.reference("task") == d.task:
+        task = get_task(d.task)
+    held = next((n for n, now in enumerate(d.success[::-1]) if not now), len(d))
     return {
         "task": d.task,
         "robot": d.robot,
         "backend": d.backend,
         "waypoints": len(d),
-        "seconds": float(d.timestamps[-1]),
-        "success": bool(d.success[-1]),
+        "seconds": float(d.timestamps[-1] - d.timestamps[0]),
+        **({} if task is None else {"success": task.achieved(d.success, d.rates.record_hz)}),
+        "goal_held_seconds": held / d.rates.record_hz,
+        "judged_by": d.judged_by,
         "placement": dict(d.task_parameters.get("placement", {})),
+        "varied_appearance": "appearance" in d.task_parameters,
         "cameras": {k: "x".join(map(str, c.rgb.shape[2:0:-1])) for k, c in d.steps.cameras.items()},
         "operator": d.operator,
         "device": d.device,
-        "seconds_spent": round(d.seconds, 1),
+        # Nobody's time was spent where a script steered.
+        **({"seconds_spent": round(d.seconds, 1)} if d.steered_by_person else {}),
         "content_hash": d.content_hash(),
     }
+
+
+def _checked(demonstration: Demonstration) -> dict[str, Any]:
+    """What is wrong with a demonstration, compared with its robot where that is one of ours."""
+    from sart_toolkit.record.checks import inspect_recording
+
+    ours = demonstration.robot in ROBOTS and demonstration.reference("robot") == demonstration.robot
+    found = inspect_recording(demonstration, get_robot(demonstration.robot) if ours else None)
+    return {"problems": list(found.problems), "warnings": list(found.warnings)}
 
 
 def describe_dataset(dataset: Dataset) -> dict[str, Any]:
@@ -80,7 +106,10 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         "seconds",
         "content_hash",
     )
-    return {k: dataset.info[k] for k in keys}
+    clearance = dataset.info.get("least_commanded_clearance_m")
+    return {k: dataset.info[k] for k in keys} | {
+        "least_commanded_clearance_mm": None if clearance is None else 1e3 * clearance
+    }
 
 
 def describe_skill(path: Path) -> dict[str, Any]:

@@ -40,4 +40,5 @@ def record_verb(args: Record) -> dict[str, Any]:
             overwrite=args.overwrite,
             progress=progress,
         )
-    return {"demonstration": str(args.out), **describe_demonstration(demonstration)}
+    task = pipeline.task_of(demonstration, args.task)
+    return {"demonstration": str(args.out), **describe_demonstration(demonstration, task)}

@@ -21,6 +21,7 @@ from sart_toolkit.data.storage import (
 )
 from sart_toolkit.errors import Discarded, NoDisplay
 from sart_toolkit.motion.controller import ControllerConfig
+from sart_toolkit.record.checks import check_recording
 from sart_toolkit.record.desk import RecordingDesk
 from sart_toolkit.record.devices.manual import ManualDevice
 from sart_toolkit.record.screen import Screen, start_sdl
@@ -57,6 +58,7 @@ def record_by_hand(
     backend, task = setup.backend, setup.task
 
     def save(demonstration: Demonstration) -> None:
+        check_recording(demonstration, backend.robot)
         check_writable(args.out, args.overwrite)
         save_demonstration(args.out, demonstration)
 

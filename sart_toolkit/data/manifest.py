@@ -31,7 +31,7 @@ class EpisodeEntry:
     """A kept episode in a dataset's index.
 
     `steps`: of its segment; `clearance` [m]: what the certificate of its commanded path proves,
-    `None` without one.
+    `None` without one; `seconds`: for how long the robot moved, `None` where nobody noted it.
     """
 
     source: int
@@ -40,6 +40,7 @@ class EpisodeEntry:
     steps: int
     content_hash: str
     clearance: float | None = None
+    seconds: float | None = None
 
     @property
     def key(self) -> AttemptKey:
@@ -53,10 +54,14 @@ class EpisodeEntry:
 
 
 class Rejection(NamedTuple):
-    """Why an attempt gave no episode: `outcome` is the same for all that fail alike."""
+    """Why an attempt gave no episode: `outcome` is the same for all that fail alike.
+
+    `seconds`: for how long the robot moved, `None` where nobody noted it.
+    """
 
     outcome: str
     detail: str
+    seconds: float | None = None
 
 
 def source_name(source: int) -> str:
@@ -123,16 +128,18 @@ class Manifest:
         self.kept.pop(key, None)
         self.rejected.pop(key, None)
         if row["outcome"] != KEPT:
-            self.rejected[key] = Rejection(str(row["outcome"]), str(row.get("detail", "")))
+            self.rejected[key] = Rejection(
+                str(row["outcome"]), str(row.get("detail", "")), _number(row.get("seconds"))
+            )
             return
         if not 0 <= key.source < len(self.sources):
             raise ValueError(f"source {key.source} of {len(self.sources)}")
-        clearance = row.get("clearance_m")
         self.kept[key] = EpisodeEntry(
             *key,
             int(row["steps"]),
             str(row["content_hash"]),
-            None if clearance is None else float(clearance),
+            _number(row.get("clearance_m")),
+            _number(row.get("seconds")),
         )
 
     @property
@@ -162,10 +169,18 @@ def kept_row(entry: EpisodeEntry) -> dict[str, Any]:
         "steps": entry.steps,
         "content_hash": entry.content_hash,
     }
-    return row if entry.clearance is None else row | {"clearance_m": entry.clearance}
+    return row | _noted(clearance_m=entry.clearance, seconds=entry.seconds)
 
 
 def rejected_row(key: AttemptKey, rejection: Rejection) -> dict[str, Any]:
     """The manifest's row of an attempt that gave no episode."""
     row = {**key._asdict(), "outcome": rejection.outcome}
-    return row | {"detail": rejection.detail} if rejection.detail else row
+    return row | _noted(detail=rejection.detail or None, seconds=rejection.seconds)
+
+
+def _noted(**fields: Any) -> dict[str, Any]:
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)

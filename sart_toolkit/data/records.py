@@ -273,7 +273,8 @@ class Demonstration(Referring):
     each step the pairs of names of bodies that have touched since the step before (none where the
     backend can't tell); `raw_commands (M, 7)`: the operator's tool velocity in each control period
     (xyz [m/s], rotation [rad/s], tool frame) and gripper target; `states`: the backend's portable
-    state at each step (empty where it has none); `seconds`: wall-clock time the person spent.
+    state at each step (empty where it has none); `seconds`: wall-clock time that a person spent, 0
+    where a script steered.
     """
 
     task: str
@@ -341,6 +342,11 @@ class Demonstration(Referring):
             waypoints=len(self),
             cameras=list(self.steps.cameras),
         )
+
+    @property
+    def steered_by_person(self) -> bool:
+        """Whether a person's time was spent; a script or a replay takes none."""
+        return self.seconds > 0 and self.device not in ("scripted", "replay")
 
     @property
     def actions(self) -> Array:

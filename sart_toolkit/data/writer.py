@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -210,6 +211,15 @@ class DatasetWriter:
         return len(self._manifest.rejected)
 
     @property
+    def executed_seconds(self) -> float | None:
+        """For how long [s] the robot moved in all attempts so far; `None` if one doesn't tell."""
+        seconds = [entry.seconds for entry in self._manifest.kept.values()]
+        seconds += [rejection.seconds for rejection in self._manifest.rejected.values()]
+        told = [value for value in seconds if value is not None]
+        # In whatever order they came, the exact sum, rounded once.
+        return math.fsum(told) if len(told) == len(seconds) else None
+
+    @property
     def rejections(self) -> dict[str, int]:
         """How many attempts gave no episode so far, by outcome."""
         return _counted(self._manifest.rejected.values())
@@ -265,7 +275,7 @@ class DatasetWriter:
                 for source in range(len(self.sources))
                 for sphere in range(len(self.sources[source].annotation.spheres))
             ],
-            "least_clearance_m": min(clearances, default=None),
+            "least_commanded_clearance_m": min(clearances, default=None),
             "content_hash": manifest.content_hash(),
             "versions": library_versions(),
         }

@@ -81,7 +81,7 @@ class EvaluateConfig:
 
 @dataclass(frozen=True)
 class Rollout:
-    """One rollout: `outcome` is success when it ended, `success_any` at any time."""
+    """One rollout: `success` as `Task.achieved` judges it, `success_any` at any single step."""
 
     episode: int
     seed: tuple[int, int]
@@ -143,8 +143,8 @@ def run_rollout(
     controller = ToolController(model, rates=rates)
     controller.reset(state.q)
     skill.reset()
-    held = 0
-    success_any = False
+    reached: list[bool] = []
+    achieved = False
     reason = None
     step = 0
     observation = backend.observe(skill.cameras)
@@ -165,19 +165,25 @@ def run_rollout(
         controller.acknowledge(sent.q)
         step += 1
         observation = backend.observe(skill.cameras)
-        success = task.success(observation)
-        success_any = success_any or success
-        held = held + 1 if success else 0
+        reached.append(task.success(observation))
         if watch is not None:
-            watch(observation, step, success)
-        if held >= round(task.hold * record_hz):
+            watch(observation, step, reached[-1])
+        achieved = task.achieved(np.array(reached), record_hz)
+        if achieved:
             break
-    success = task.success(observation)
-    if not success and reason is None:
-        reason = task.failure_reason(observation)
+    if not achieved and reason is None:
+        reason = _shortfall(task, reached, record_hz) or task.failure_reason(observation)
     return Rollout(
-        seed[1], seed, placement, success, success_any, step, None if success else reason
+        seed[1], seed, placement, achieved, any(reached), step, None if achieved else reason
     )
+
+
+def _shortfall(task: Task, reached: Sequence[bool], record_hz: int) -> str:
+    """By how much the goal was reached too late; empty where it isn't reached at the end."""
+    held = next((n for n, now in enumerate(reversed(reached)) if not now), len(reached))
+    if not held:
+        return ""
+    return f"goal reached only for the last {held / record_hz:g} s, not for {task.hold:g} s"
 
 
 class _Worker:
@@ -372,14 +378,26 @@ def _videos(
     for outcome in outcomes:
         chosen = [row["episode"] for row in episodes if row["outcome"] == outcome]
         for episode in chosen[: config.videos]:
-            name = f"videos/{outcome}_{episode:03d}.mp4"
+            moments, again = _filmed(worker, episode)
+            # What is seen is the run that was filmed, which need not end as the first one did.
+            shown: Literal["success", "failure"] = "success" if again.success else "failure"
+            name = f"videos/{shown}_{episode:03d}.mp4"
             hz = worker.skill.demonstration.rates.record_hz
-            film(directory / name, _moments(worker, episode), hz, episode, outcome)
-            rows.append({"path": name, "episode": episode, "outcome": outcome})
+            film(directory / name, moments, hz, episode, shown)
+            row = {"path": name, "episode": episode, "outcome": shown}
+            if shown != outcome:
+                _log.warning(
+                    "video of episode %d: it was a %s when it was evaluated, and a %s when it was "
+                    "run again to be filmed",
+                    episode, outcome, shown,
+                )  # fmt: skip
+                row["evaluated_outcome"] = outcome
+            rows.append(row)
     return rows
 
 
-def _moments(worker: _Worker, episode: int) -> list[Moment]:
+def _filmed(worker: _Worker, episode: int) -> tuple[list[Moment], Rollout]:
+    """What the cameras see when an episode is run again, and how that ends."""
     moments: list[Moment] = []
     hz = worker.skill.demonstration.rates.record_hz
 
@@ -392,5 +410,4 @@ def _moments(worker: _Worker, episode: int) -> list[Moment]:
         wrist = seen.cameras[worker.skill.cameras[0]].rgb
         moments.append(Moment(view, wrist, step / hz, success))
 
-    worker(episode, watch)
-    return moments
+    return moments, worker(episode, watch)

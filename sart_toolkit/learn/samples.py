@@ -174,6 +174,7 @@ def open_windows(
         progress: called with (read, in all) after each demonstration or episode.
 
     Raises:
+        InvalidInput: the demonstration holds no images.
         UnknownName: a demonstration has no such camera.
         Mismatch: an episode belongs to another demonstration, or was seen by another camera.
         CannotWrite: the disk refuses, or has too little room.
@@ -212,6 +213,11 @@ def remove_windows(directory: Path) -> None:
 
 def _layout(dataset: Dataset, config: WindowConfig) -> FrameLayout:
     cameras = dataset.sources[0].demonstration.steps.cameras
+    if not cameras:
+        raise InvalidInput(
+            "the dataset's first demonstration holds no images; record one with a camera, such as "
+            "--cameras wrist, and generate from it"
+        )
     for camera in config.cameras:
         if camera not in cameras:
             raise unknown_name("camera", camera, cameras)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from sart_toolkit.data.records import Demonstration
-from sart_toolkit.errors import DeviceLost, SartError
+from sart_toolkit.errors import DeviceLost, InvalidInput, SartError
 from sart_toolkit.record.devices.manual import Control, ManualDevice
 from sart_toolkit.record.session import End, SessionState, TeleopSession
 
@@ -204,6 +204,9 @@ class RecordingDesk:
         demonstration = session.demonstration(device.operator, device.name, session.seconds_spent)
         try:
             self._save(demonstration)
+        except InvalidInput as error:
+            self._said = Notice(f"Not saved: {error}. ← records again.", "bad")
+            return
         except SartError as error:
             self._said = Notice(f"Not saved: {error}. → saves again; nothing is lost.", "bad")
             return

@@ -61,9 +61,21 @@ class StepRecorder:
         self._force.append(force)
         return observation
 
-    def steps(self, order: slice = slice(None)) -> Steps:
-        """The rows recorded, or some of them in the order of a slice (reversed, for instance)."""
+    def steps(self, backwards: bool = False) -> Steps:
+        """The rows recorded, in their order or as if time had run backwards.
+
+        Backwards, joints move the opposite way, so that their velocities change sign. A row's
+        contact force is that of the step before it, so each belongs to the row before; the first
+        row, before which there is no step, has none, or NaN where the backend can't tell.
+        """
+        order = slice(None, None, -1 if backwards else 1)
         rows = self.observations[order]
+        joint_velocities = np.stack([row.dq for row in rows])
+        force = np.array(self._force)
+        if backwards:
+            joint_velocities = -joint_velocities
+            unknown = bool(np.isnan(force).all())
+            force = np.append(np.nan if unknown else 0.0, force[:0:-1])
         spec = self._backend.cameras
         cameras = {}
         for name, frame in self._frames.items():
@@ -77,12 +89,12 @@ class StepRecorder:
             )
         return Steps(
             joint_positions=np.stack([row.q for row in rows]),
-            joint_velocities=np.stack([row.dq for row in rows]),
+            joint_velocities=joint_velocities,
             commanded_joint_positions=np.stack(self._commanded_q[order]),
             measured_Ts_world_tool=np.stack([row.T_world_tool for row in rows]),
             commanded_Ts_world_tool=np.stack(self._commanded_T[order]),
             measured_gripper=np.array([row.gripper for row in rows]),
             commanded_gripper=np.array(self._commanded_gripper[order]),
-            contact_force=np.array(self._force[order]),
+            contact_force=force,
             cameras=cameras,
         )

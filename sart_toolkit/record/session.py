@@ -36,6 +36,7 @@ from sart_toolkit.registry import reference_to
 from sart_toolkit.robots import ROBOTS
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import check_gripper
+from sart_toolkit.scenes.appearance import Appearance
 from sart_toolkit.scenes.spec import SceneState
 from sart_toolkit.tasks import TASKS
 from sart_toolkit.tasks.task import Placement, Task
@@ -107,7 +108,7 @@ class SessionConfig:
     Without `keep_states` no generated trajectory can start from it, and recording is faster.
     `end_on_success`: it ends by itself once the goal has been reached for the task's `hold`.
     `references`: what names "robot", "task" or "backend" in the demonstration, where that isn't to
-    be found out.
+    be found out; `appearance`: that of the backend, where it isn't the task's own, to be kept.
     """
 
     cameras: tuple[str, ...] = ("wrist",)
@@ -116,6 +117,7 @@ class SessionConfig:
     end_on_success: bool = False
     controller: ControllerConfig = field(default_factory=ControllerConfig)
     references: Mapping[str, str] = field(default_factory=dict)
+    appearance: Appearance | None = None
 
     def __post_init__(self) -> None:
         check_positive("max_seconds", self.max_seconds, "s")
@@ -211,6 +213,8 @@ class TeleopSession:
         self._states = [self._saves.save()] if self._saves is not None else []
         self.judged_by: Judge = "task" if self._judges else "nobody"
         self._success, self._raw = [self._reached()], list[Array]()
+        # The recorded step that comes after each pause, and how long [s] that was.
+        self._pauses: list[tuple[int, float]] = []
         self._touching: list[tuple[tuple[str, str], ...]] = [()]
         self._touched: set[tuple[str, str]] = set()
         self._pressed = self._no_force()
@@ -289,6 +293,8 @@ class TeleopSession:
             InvalidInput: there is nothing to start or resume.
         """
         self._expect("start", SessionState.READY, SessionState.PAUSED)
+        # The clock of a robot goes on while it stands.
+        self._pauses.append((len(self._success), self.backend.observe().time - self._now.time))
         if self._started_at is None:
             self._started_at = self._clock()
         self.state = SessionState.RECORDING
@@ -342,7 +348,7 @@ class TeleopSession:
             raise InvalidInput(
                 "say_reached: this backend itself decides whether the goal is reached"
             )
-        held = min(len(self._success), max(1, round(self.task.hold * self._record_hz)))
+        held = min(len(self._success), self.task.steps_held(self._record_hz))
         self._success[-held:] = [True] * held
         self.judged_by = "person"
 
@@ -445,6 +451,14 @@ class TeleopSession:
 
     # --- the result -----------------------------------------------------------------------------
 
+    def _timestamps(self) -> Array:
+        """When each step was measured `(T,)` [s], pauses left out; 0 at the first."""
+        times = np.array([row.time for row in self._recorder.observations])
+        for step, pause in self._pauses:
+            times[step:] -= pause
+        # Where a clock counts periods, its rounding errors are not to show.
+        return np.round(times - times[0], 9)
+
     def demonstration(
         self, operator: str, device: str, seconds: float, seed: int | None = None
     ) -> Demonstration:
@@ -468,13 +482,16 @@ class TeleopSession:
             "backend": reference_to("backend", type(self.backend), BACKENDS),
             **self.config.references,
         }
+        parameters = {"placement": self.placement.to_json()}
+        if self.config.appearance is not None:
+            parameters["appearance"] = self.config.appearance.to_json()
         return Demonstration(
             task=self.task.name,
-            task_parameters={"placement": self.placement.to_json()},
+            task_parameters=parameters,
             robot=self.model.spec.name,
             backend=self.backend.name,
             steps=steps,
-            timestamps=np.arange(len(steps)) / self._record_hz,
+            timestamps=self._timestamps(),
             body_Ts_world={
                 name: np.stack([row.Ts_world_body[name] for row in rows])
                 for name in rows[0].Ts_world_body
@@ -507,7 +524,7 @@ def record_demonstration(
     """One demonstration of a task, steered by a device until it says stop, as fast as it goes.
 
     A command that leads out of reach is not carried out: the tool stays where it is. No person's
-    time is spent, so `seconds` is the length of the recording.
+    time is spent, so `seconds` is 0.
 
     Args:
         backend: the robot in the task's scene.
@@ -537,5 +554,4 @@ def record_demonstration(
             f"the demonstration did not end within {session.config.max_seconds:g} s: "
             f"{session.failure_reason}; steer on, or allow more with max_seconds"
         )
-    seconds = session.steps / backend.rates.record_hz
-    return session.demonstration(device.operator, device.name, seconds, seed)
+    return session.demonstration(device.operator, device.name, 0.0, seed)

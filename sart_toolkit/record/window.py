@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from sart_toolkit.backends.interface import SensesContacts
 from sart_toolkit.data.records import Image
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.record.desk import FIRM, RecordingDesk, Tone
 from sart_toolkit.record.devices.manual import SPEEDS, Control
 from sart_toolkit.record.screen import (
@@ -98,7 +99,12 @@ class RecordingWindow:
             desk: the recording.
             screen: where it is drawn.
             target: where it will be saved, for the person to read.
+
+        Raises:
+            InvalidInput: the recording has no camera.
         """
+        if not desk.session.config.cameras:
+            raise InvalidInput("window: the recording has no camera to show; record with one")
         self._desk, self._screen, self._target = desk, screen, target
         cameras = [camera.name for camera in desk.session.backend.scene.cameras]
         self._camera = cameras[0] if cameras else desk.session.config.cameras[0]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,50 @@ class AppearanceConfig:
             value = getattr(self, field.name)
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidInput(f"{field.name}: expected a finite number >= 0, got {value}")
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """A random appearance that can be drawn again: its generator's seed, and how far it varies.
+
+    A recording keeps it as JSON, so that robot and scene look the same whenever they are made again
+    for it.
+    """
+
+    seed: tuple[int, ...]
+    config: AppearanceConfig = dataclasses.field(default_factory=AppearanceConfig)
+
+    def __post_init__(self) -> None:
+        seed = tuple(self.seed)
+        if not seed or not all(type(number) is int and number >= 0 for number in seed):
+            raise InvalidInput(f"seed: expected whole numbers >= 0, got {self.seed!r}")
+        object.__setattr__(self, "seed", seed)
+
+    def applied(self, robot: RobotSpec, scene: SceneSpec) -> tuple[RobotSpec, SceneSpec]:
+        """Robot and scene as they look: see `randomise_appearance`."""
+        return randomise_appearance(robot, scene, np.random.default_rng(self.seed), self.config)
+
+    def to_json(self) -> dict[str, Any]:
+        """The appearance as JSON values."""
+        return {"seed": list(self.seed), "config": dataclasses.asdict(self.config)}
+
+    @staticmethod
+    def from_json(value: Any) -> Appearance:
+        """The appearance from JSON values.
+
+        Raises:
+            InvalidInput: a field is unknown, missing or wrong.
+        """
+        try:
+            config = AppearanceConfig(**value["config"])
+            unknown = set(value) - {"seed", "config"}
+            if unknown or not isinstance(value, Mapping):
+                raise TypeError(f"unknown {sorted(unknown)}")
+            return Appearance(tuple(value["seed"]), config)
+        except (KeyError, TypeError) as error:
+            raise InvalidInput(
+                f"appearance: expected seed and config, got {value!r} ({error})"
+            ) from error
 
 
 def randomise_appearance(

@@ -120,11 +120,18 @@ class Task(abc.ABC):
     ) -> bool:
         """Whether the goal was reached at the end and had been for `hold` seconds.
 
+        The one rule by which a sequence counts as a success: a demonstration, a replay, a rollout.
+
         Args:
             success: `(T,)`, whether it was reached at each recorded step.
             record_hz: recorded steps a second.
         """
-        return bool(np.all(success[-max(1, round(self.hold * record_hz)) :]))
+        least = self.steps_held(record_hz)
+        return len(success) >= least and bool(np.all(success[-least:]))
+
+    def steps_held(self, record_hz: int = DEFAULT_RATES.record_hz) -> int:
+        """At how many steps up to the end the goal must have been reached."""
+        return max(1, round(self.hold * record_hz))
 
     def sample_placement(self, rng: np.random.Generator, yaw_deg: float = 0.0) -> Placement:
         """A placement drawn uniformly from the square of half width `placement_range`.

@@ -268,6 +268,19 @@ def test_w_saves_what_loads_again_with_the_seconds_spent(session, open_session, 
     assert again.refused is False and load_annotation(tmp_path / "a.json").seconds == 14.5
 
 
+def test_saving_names_the_spheres_that_are_not_proved_clear(session, tmp_path):
+    press(session, "Enter", "W")
+    assert "NOT proved" not in session.message and session.unproved == []
+    session.perform("go", 26)
+    press(session, "Enter")
+    session.perform("radius", 60)
+    press(session, "W")
+    assert not session.refused and len(load_annotation(tmp_path / "a.json").spheres) == 2
+    (named,) = session.unproved
+    assert named.startswith("waypoint 26, 60.0 mm: colliding: up to ")
+    assert session.message.endswith(f"; NOT proved clear: {named}")
+
+
 @pytest.mark.parametrize("key", ["Q", "Escape"])
 def test_leaving_asks_once_about_changes_that_are_not_saved(session, tmp_path, key):
     press(session, "Enter", key)

@@ -245,8 +245,67 @@ def test_attempts_that_would_touch_are_rejected_and_counted_by_what_touched(crow
     assert total == info["rejections"]
     assert all(isinstance(count, int) for count in info["rejections"].values())
     assert info["n_attempted"] == info["n_kept"] + sum(info["rejections"].values())
-    assert info["simulated_seconds"] == pytest.approx(0.8 * info["n_attempted"])
     assert info["content_hash"] == crowded_dataset.content_hash
+
+
+def test_simulated_seconds_are_those_that_the_robot_moved(
+    peg_demonstration, crowded, make_peg_backend, crowded_dataset, augment, tmp_path
+):
+    """Counted at the simulator; the same with two processes, and after an interruption."""
+    periods = []
+
+    def counting():
+        backend = make_peg_backend()
+        step = backend.step
+        backend.step = lambda: (periods.append(1), step())
+        return backend
+
+    info = augment_demonstration(
+        peg_demonstration, crowded, counting, tmp_path / "counted", CROWDED
+    ).info
+    assert info["rejections"]["path too close peg / block"] > 0, "some were never executed"
+    assert info["simulated_seconds"] == pytest.approx(len(periods) / 30, abs=1e-9)
+    assert info["simulated_seconds"] < 0.8 * info["n_attempted"]
+    assert info["simulated_seconds"] == crowded_dataset.info["simulated_seconds"]
+    two = augment(crowded, tmp_path / "two", workers=2).info
+    with pytest.raises(KeyboardInterrupt):
+        augment(crowded, tmp_path / "cut", progress=Interrupt(3))
+    resumed = augment(crowded, tmp_path / "cut").info
+    assert two["simulated_seconds"] == resumed["simulated_seconds"] == info["simulated_seconds"]
+
+
+def test_a_manifest_that_does_not_tell_how_long_attempts_took_gives_no_sum(
+    crowded, augment, tmp_path
+):
+    with pytest.raises(KeyboardInterrupt):
+        augment(crowded, tmp_path / "d", progress=Interrupt(3))
+    manifest = tmp_path / "d" / "manifest.jsonl"
+    manifest.write_text(re.sub(r', "seconds": [\d.]+', "", manifest.read_text()))
+    assert augment(crowded, tmp_path / "d").info["simulated_seconds"] is None
+
+
+def test_episodes_tell_the_force_that_was_measured_or_that_none_was(
+    peg_demonstration, peg_annotation, peg_backend, limited, monkeypatch
+):
+    sources, key = [(peg_demonstration, peg_annotation)], AttemptKey(0, 0, 0)
+    forces = itertools.count(1)
+    with monkeypatch.context() as patch:
+        patch.setattr(peg_backend, "force", lambda: float(next(forces)))
+        seen = RestoreExecutor(peg_backend, sources, AugmentConfig()).attempt(key).episode
+    # Outwards 3, 6, ... 60 at the end of each step of three periods; 60 comes first backwards.
+    np.testing.assert_array_equal(seen.steps.contact_force, [0, *range(60, 3, -3)])
+    blind = limited(peg_backend, SavesStates, KnowsBodies)
+    unseen = RestoreExecutor(blind, sources, AugmentConfig()).attempt(key).episode
+    assert np.isnan(unseen.steps.contact_force).all()
+
+
+def test_joint_velocities_of_an_episode_are_those_of_its_own_motion(peg_dataset):
+    for episode in peg_dataset:
+        q, dq = episode.steps.joint_positions, episode.steps.joint_velocities
+        moved = np.diff(q, axis=0)
+        fast = np.abs(moved) > 0.02
+        assert fast.any()
+        np.testing.assert_array_equal(np.sign(moved)[fast], np.sign(dq[1:])[fast])
 
 
 def test_a_sphere_that_gives_nothing_leaves_fewer_trajectories_and_a_warning(
@@ -316,7 +375,7 @@ def test_what_touches_in_spite_of_the_proof_ends_the_segment_at_once(
     ).attempt
     key = AttemptKey(0, 0, 0)
     assert make(key) == Attempt(
-        key, "contact block / peg", None, "contact block / peg: stopped there"
+        key, "contact block / peg", None, "contact block / peg: stopped there", seconds=7 / 30
     )
     assert len(steps) == 7
 
@@ -696,6 +755,12 @@ def test_a_finished_dataset_is_returned_without_another_attempt(
     assert again.info["seconds"] > 0
 
 
+def test_how_long_an_interrupted_generation_took_is_not_claimed(crowded, augment, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        augment(crowded, tmp_path / "d", progress=Interrupt(3))
+    assert augment(crowded, tmp_path / "d").info["seconds"] is None
+
+
 # --- several demonstrations ---------------------------------------------------------------------
 
 
@@ -786,9 +851,15 @@ def test_an_unknown_executor_is_refused_with_the_nearest_name(annotate, augment,
 
 @pytest.mark.parametrize("finished", [True, False])
 def test_a_directory_made_with_other_settings_is_left_alone_unless_overwritten(
-    annotate, augment, tmp_path, finished
+    annotate, augment, peg_demonstration, make_peg_backend, tmp_path, finished
 ):
     annotation, out = annotate((0, 0.03)), tmp_path / "d"
+
+    def larger():
+        backend = make_peg_backend()
+        backend.image_size = (64, 64)
+        return backend
+
     config = AugmentConfig(n=3, duration=0.8)
     if finished:
         augment(annotation, out, config)
@@ -804,6 +875,10 @@ def test_a_directory_made_with_other_settings_is_left_alone_unless_overwritten(
         (
             lambda: augment(annotation, out, dataclasses.replace(config, seed=1)),
             r"request.config.seed 0, now 1\)",
+        ),
+        (
+            lambda: augment_demonstration(peg_demonstration, annotation, larger, out, config),
+            r"request.image_size.0 48, now 64, request.image_size.1 48, now 64\)",
         ),
         (lambda: augment(annotate((0, 0.031)), out, config), r"sources.0.annotation .*, now .*\)"),
     ):

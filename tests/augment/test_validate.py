@@ -64,8 +64,11 @@ def test_what_was_generated_holds(made, validate):
     assert not found.problems
     assert found.episodes == 3 and seen == [(1, 3), (2, 3), (3, 3)]
     proofs = [e.provenance.certificate for e in load_dataset(made)]
-    stated = min(min(p["commanded"]["clearance"], p["measured"]["clearance"]) for p in proofs)
-    assert found.least_clearance == pytest.approx(stated, abs=1.1e-5)
+    for which in ("commanded", "measured"):
+        stated = min(p[which]["clearance"] for p in proofs)
+        found_least = getattr(found, f"least_{which}_clearance")
+        assert found_least == pytest.approx(stated, abs=1.1e-5)
+    assert found.least_commanded_clearance != found.least_measured_clearance
     assert found.largest_deviation == pytest.approx(max(p["deviation"] for p in proofs), abs=2e-6)
 
 

@@ -93,6 +93,42 @@ def test_words_and_keys_from_a_pipe_are_done_in_turn(annotate, demo, tmp_path):
     assert not result["saved"] and len(load_annotation(out).spheres) == 1
 
 
+def test_a_sphere_that_collides_is_named_when_saved_in_the_list_and_by_augment(
+    annotate, demo, tmp_path, caplog, monkeypatch
+):
+    out = tmp_path / "a.json"
+    words = "add go 26 add radius 60 list save quit"
+    result, said = annotate(demo, "--text", "--out", out, words=words)
+    listed = [line for line in said.splitlines() if line.startswith("   26  60.0 mm, by hand")]
+    assert len(listed) == 1 and "colliding: up to" in listed[0]
+    assert "NOT proved clear: waypoint 26, 60.0 mm: colliding: up to" in said
+    assert [s["waypoint"] for s in result["spheres"]] == [0, 26]
+    (named,) = result["not_proved_clear"]
+    assert named.startswith("waypoint 26, 60.0 mm: colliding")
+
+    class Reached(Exception):
+        pass
+
+    def engine(*_, **__):
+        raise Reached
+
+    monkeypatch.setattr("sart_toolkit.augment.engine.augment_demonstration", engine)
+    with pytest.raises(Reached):
+        main(["augment", str(demo), str(out), "--out", str(tmp_path / "d")])
+    (warning,) = [r.getMessage() for r in caplog.records if "not proved" in r.getMessage()]
+    assert warning.startswith("sphere not proved clear: waypoint 26, 60.0 mm: colliding: up to")
+    # A suggested radius that was edited in the file is no longer backed either.
+    annotate(demo, "--suggest-all", "--no-window", "--out", out, "--overwrite")
+    value = json.loads(out.read_text())
+    value["spheres"][1]["radius_m"] = value["spheres"][1]["clearance_m"] + 0.001
+    out.write_text(json.dumps(value))
+    caplog.clear()
+    with pytest.raises(Reached):
+        main(["augment", str(demo), str(out), "--out", str(tmp_path / "d")])
+    (warning,) = [r.getMessage() for r in caplog.records if "not proved" in r.getMessage()]
+    assert f"waypoint {value['spheres'][1]['waypoint']}, " in warning
+
+
 def test_what_a_pipe_left_unsaved_is_gone_on_with(annotate, demo):
     result, said = annotate(demo, "--text", words="add grow")
     assert result == result | {"annotation": None, "saved": False, "presses": 2}

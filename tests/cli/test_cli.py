@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import shutil
@@ -9,12 +10,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from sart_toolkit import pipeline
 from sart_toolkit.backends import BACKENDS
 from sart_toolkit.cli import main
+from sart_toolkit.data.dataset import load_dataset
+from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import load_demonstration
 from sart_toolkit.doctor import Finding
+from sart_toolkit.robots import get_robot
+from sart_toolkit.scenes.appearance import Appearance, AppearanceConfig
 from sart_toolkit.tasks import TASKS, get_task
 
 
@@ -114,6 +121,9 @@ def test_info_tells_each_kind_of_file(chain: Path, capsys: pytest.CaptureFixture
     }
     for name, kind in kinds.items():
         assert run(capsys, "info", chain / name)["kind"] == kind
+    said = run(capsys, "info", chain / "demo.h5")
+    assert "seconds_spent" not in said, "no person spent any"
+    assert said["success"] is True and said["goal_held_seconds"] >= 1.0
     main(["info", str(chain / "demo.h5")])
     assert "peg_in_hole" in capsys.readouterr().out
     assert "no run, skill or dataset" in error(capsys, "info", chain)
@@ -143,7 +153,10 @@ def test_validate_proves_a_dataset_again_and_names_what_does_not_hold(
 ) -> None:
     found = run(capsys, "validate", chain / "data")
     assert found["episodes"] == 4
-    assert 0 < found["least_clearance_mm"] < 100
+    assert 0 < found["least_measured_clearance_mm"] < 100
+    assert 0.2 <= found["least_commanded_clearance_mm"] < 100
+    stated = run(capsys, "info", chain / "data")["least_commanded_clearance_mm"]
+    assert found["least_commanded_clearance_mm"] == pytest.approx(stated, abs=0.011)
     assert 0 < found["largest_deviation_mm"] < 5
     broken = shutil.copytree(chain / "data", tmp_path / "data")
     episode = sorted(broken.glob("episodes/*/*.h5"))[0]
@@ -351,6 +364,53 @@ def test_yaw_and_appearance_vary_only_where_asked_for(
     assert (plain.raw_commands == varied.raw_commands).all()
     images = [d.steps.cameras["wrist"].rgb[0].astype(int) for d in (plain, varied)]
     assert abs(images[0] - images[1]).mean() > 2
+    assert "appearance" not in plain.task_parameters
+
+
+def test_what_was_recorded_with_varied_appearance_is_augmented_alike_and_trained_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    demo, spheres, data = (tmp_path / name for name in ("d.h5", "a.json", "data"))
+    run(
+        capsys, "record", "peg_in_hole", "--vary-appearance", "--image-size", 32, "--out", demo,
+        "--seed", 4,
+    )  # fmt: skip
+    assert run(capsys, "info", demo)["varied_appearance"] is True
+    run(capsys, "suggest", demo, "--out", spheres)
+    run(capsys, "augment", demo, spheres, "--out", data, "--n", 4)
+    dataset = load_dataset(data)
+    recorded = load_demonstration(demo).steps.cameras["wrist"]
+    episode = dataset.episode(0).steps.cameras["wrist"]
+    np.testing.assert_allclose(episode.T_frame_camera, recorded.T_frame_camera, atol=1e-6)
+    # A corner that shows the table throughout.
+    colours = [images.rgb[:, -1, 0].mean(0) for images in (recorded, episode)]
+    np.testing.assert_allclose(colours[0], colours[1], atol=6)
+    said = run(capsys, "train", data, "--out", tmp_path / "skill", "--epochs", 1, "--device", "cpu")
+    assert said["trajectories"] == 4
+
+
+def test_a_recording_s_backend_looks_as_it_did(peg_demonstration: Demonstration) -> None:
+    task = get_task("peg_in_hole")
+    plain = get_robot(task.robot), task.scene
+    appearance = Appearance((4, 1), AppearanceConfig(light=0.4))
+    for parameters, expected in (({}, plain), ({"appearance": appearance.to_json()},
+                                               appearance.applied(*plain))):  # fmt: skip
+        demonstration = dataclasses.replace(
+            peg_demonstration, task_parameters={**peg_demonstration.task_parameters, **parameters}
+        )
+        made = pipeline.backend_maker(demonstration, (32, 32)).args
+        assert repr(made[1:3]) == repr(expected)
+    assert repr(appearance.applied(*plain)) != repr(plain)
+
+
+def test_another_backend_than_the_demonstration_s_is_refused_at_once(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--out", tmp_path / "d"]
+    said = error(capsys, *argv, "--backend", "sapien")
+    assert "backend 'sapien': can't restore the states that backend 'pybullet' has saved" in said
+    assert "augment on 'pybullet', or record a demonstration on 'sapien'" in said
+    assert not (tmp_path / "d").exists()
 
 
 def test_the_operator_benchmark_prints_a_rate_for_each_task_and_backend(

@@ -85,8 +85,21 @@ def test_without_a_display_the_remedy_is_reported_and_nothing_written(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture
+def any_length(monkeypatch):
+    """Recordings of two steps may be saved."""
+    monkeypatch.setattr("sart_toolkit.cli.teleop.check_recording", lambda *_: None)
+
+
+def test_a_person_s_recording_that_cannot_be_learned_from_is_not_saved(tmp_path, capsys, dummy):
+    dummy("right", "right", "right", "right", "escape")
+    said = error(capsys, *RECORD, tmp_path / "d.h5", *BY_HAND)
+    assert "discarded, nothing was written" in said
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_person_s_recording_short_of_the_goal_is_saved_when_asked_twice(
-    tmp_path, capsys, dummy, monkeypatch
+    tmp_path, capsys, dummy, monkeypatch, any_length
 ):
     monkeypatch.setattr("sart_toolkit.record.window._SAVED_SHOWN", 0.0)
     dummy("right", "right", "right", "right")
@@ -104,7 +117,9 @@ def test_a_discarded_recording_writes_nothing_and_says_so(tmp_path, capsys, dumm
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_disk_that_is_full_at_first_costs_nothing(tmp_path, capsys, dummy, monkeypatch):
+def test_a_disk_that_is_full_at_first_costs_nothing(
+    tmp_path, capsys, dummy, monkeypatch, any_length
+):
     monkeypatch.setattr("sart_toolkit.record.window._SAVED_SHOWN", 0.0)
     attempts = []
 

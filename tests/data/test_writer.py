@@ -51,7 +51,7 @@ def test_a_finished_dataset_says_how_its_attempts_ended(carry_out, tmp_path):
     assert info["by_sphere"] == [
         {"source": 0, "waypoint": t, "kept": N, "rejections": {"joint jump": 1}} for t in (0, 2)
     ]
-    assert info["least_clearance_m"] == 0.001 and info["task"] == "nothing"
+    assert info["least_commanded_clearance_m"] == 0.001 and info["task"] == "nothing"
 
 
 def test_what_is_missing_are_the_first_attempts_that_could_do(source_of, episode_of, tmp_path):
@@ -64,7 +64,7 @@ def test_what_is_missing_are_the_first_attempts_that_could_do(source_of, episode
         assert writer.missing(0, 1, 1, 9) == writer.missing(0, 1, 0, 9) == []
         assert writer.missing(0, 0, 2, 9) == [AttemptKey(0, 0, 0), AttemptKey(0, 0, 1)]
         assert (writer.n_kept, writer.n_rejected) == (1, 1)
-        assert writer.last_rejection == ("joint jump", "detail")
+        assert writer.last_rejection == Rejection("joint jump", "detail")
 
 
 @pytest.mark.parametrize("after", [0, 1, 7, 11, 12])

@@ -125,6 +125,26 @@ def test_success_that_does_not_last_is_counted_apart(roll_out, peg_demonstration
     assert result.to_json("block")["success_any"] is True
 
 
+def test_success_at_the_last_steps_alone_is_a_failure_that_says_so(roll_out, replay, peg_task):
+    """The horizon ends while the goal has been reached for less than the task's hold."""
+    watched = []
+    whole = roll_out(replay, watch=lambda *seen: watched.append(seen))
+    for n_held in (1, 9, 10):
+        task = get_task("peg_in_hole")
+        task.horizon = (whole.steps - 10 + n_held) / DEFAULT_RATES.record_hz
+        result = roll_out(replay, task=task)
+        assert result.success_any and result.success is (n_held == 10)
+        expected = f"goal reached only for the last {n_held / 10:g} s, not for 1 s"
+        assert result.reason == (None if result.success else expected)
+
+
+@pytest.mark.parametrize("n_held", [1, 9])
+def test_a_sequence_shorter_than_the_hold_is_no_success(peg_task, n_held):
+    assert not peg_task.achieved(np.ones(n_held, bool))
+    assert not peg_task.achieved(np.zeros(0, bool))
+    assert peg_task.achieved(np.ones(10, bool))
+
+
 def test_steering_out_of_reach_ends_the_rollout_with_that_reason(roll_out, peg_model):
     away = peg_model.fk(peg_model.spec.home)[:3, :3].T @ [0.019, 0.0, 0.0]
     result = roll_out(Player([np.append([*away, 0, 0, 0], 0.67)] * 100))
@@ -331,6 +351,41 @@ def test_two_evaluations_of_one_result_at_once_are_refused(evaluate, short_task,
 
     evaluate(Player(), short_task, EvaluateConfig(2), out=tmp_path / "e.json", progress=meanwhile)
     assert read_json(tmp_path / "e.json")["n_episodes"] == 2
+
+
+def test_a_video_carries_the_outcome_of_the_run_that_it_shows(evaluate, replay, tmp_path, caplog):
+    """The policy fails when it is evaluated, and succeeds when it is run again."""
+
+    class Improving(Player):
+        rollouts = 0
+
+        def reset(self):
+            super().reset()
+            self.rollouts += 1
+            self.actions = replay.actions if self.rollouts == 2 else []
+
+    task = get_task("peg_in_hole")
+    task.placement_range, task.horizon = 0.002, 13.0
+    filmed = []
+    result = evaluate(
+        Improving(),
+        task,
+        EvaluateConfig(episodes=1, videos=1),
+        out=tmp_path / "e" / "evaluation.json",
+        film=lambda *asked: filmed.append(asked),
+    )
+    assert result["episodes"][0]["outcome"] == "failure" and result["n_success"] == 0
+    assert result["videos"] == [
+        {
+            "path": "videos/success_000.mp4",
+            "episode": 0,
+            "outcome": "success",
+            "evaluated_outcome": "failure",
+        }
+    ]
+    ((path, moments, _, _, outcome),) = filmed
+    assert path.name == "success_000.mp4" and outcome == "success" and moments[-1].success
+    assert "it was a failure when it was evaluated, and a success when" in caplog.text
 
 
 def test_without_a_camera_outside_there_are_no_videos_and_that_is_said(

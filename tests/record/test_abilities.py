@@ -26,7 +26,12 @@ from sart_toolkit.record.devices.keyboard import Keyboard
 from sart_toolkit.record.devices.manual import Control
 from sart_toolkit.record.replay import replay_demonstration
 from sart_toolkit.record.scripted import ScriptedOperator
-from sart_toolkit.record.session import SessionConfig, TeleopSession, record_demonstration
+from sart_toolkit.record.session import (
+    SessionConfig,
+    TeleopCommand,
+    TeleopSession,
+    record_demonstration,
+)
 from sart_toolkit.report.player import Playback, SceneView
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.spec import CameraSpec
@@ -101,6 +106,31 @@ def test_a_person_says_whether_the_goal_was_reached_where_the_backend_can_t(
     (demo,) = saved
     assert demo.judged_by == "person" and peg_task.achieved(demo.success)
     assert not demo.success[: -round(peg_task.hold * 10)].any()
+
+
+def test_time_is_as_the_robot_measured_it_without_pauses(core, peg_task, peg_model, monkeypatch):
+    """A clock that goes on while the robot stands, and once loses a second while it moves."""
+    lost, observe = [0.0], core.observe
+
+    def delayed(*args):
+        seen = observe(*args)
+        return dataclasses.replace(seen, time=seen.time + lost[0])
+
+    monkeypatch.setattr(core, "observe", delayed)
+    session = TeleopSession(core, peg_task, peg_model, config=BLIND)
+    still = TeleopCommand(np.zeros(6), 0.67)
+    for gap in (7.0, 5.0):  # before the start, and in a pause
+        lost[0] += gap
+        session.start()
+        for _ in range(9):
+            session.advance(still)
+        session.pause()
+    session.start()
+    lost[0] += 1.0
+    session.advance(still)
+    session.stop()
+    times = session.demonstration("operator", "device", 1.0).timestamps
+    np.testing.assert_allclose(times, [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 1.7], atol=1e-6)
 
 
 def test_a_person_s_word_is_not_asked_where_the_backend_tells(peg_backend, peg_task, peg_model):

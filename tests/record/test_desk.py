@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sart_toolkit.errors import CannotWrite, DeviceLost
+from sart_toolkit.record.checks import check_recording
 from sart_toolkit.record.desk import RecordingDesk
 from sart_toolkit.record.devices.keyboard import Keyboard
 from sart_toolkit.record.devices.manual import Control
@@ -153,6 +154,22 @@ def test_a_save_that_fails_loses_nothing_and_can_be_repeated(
     full[0] = False
     desk.press(NEXT)
     assert saved == [desk.demonstration]
+
+
+def test_a_recording_that_cannot_be_learned_from_is_to_be_recorded_again(
+    make_session, keyboard, saved
+):
+    def save(demonstration):
+        check_recording(demonstration)
+        saved.append(demonstration)
+
+    desk = RecordingDesk(make_session(), keyboard, save)
+    recorded(desk, 2.0)
+    for _ in range(3):
+        desk.press(NEXT)
+    assert not saved and desk.session.state is SessionState.ENDED
+    assert desk.notice.text.startswith("Not saved: demonstration: nothing moves: for 22 steps")
+    assert "← records again" in desk.notice.text and "→ saves" not in desk.notice.text
 
 
 def test_seconds_spent_are_kept_with_the_demonstration(

@@ -45,15 +45,38 @@ def test_each_row_holds_what_was_measured_commanded_and_seen(recorder, peg_model
         )
 
 
-def test_a_reversed_record_has_the_same_rows_in_the_opposite_order(recorder):
-    forward, backward = recorder.steps().content(), recorder.steps(slice(None, None, -1)).content()
+def test_a_record_backwards_has_the_same_rows_in_the_opposite_order(recorder):
+    forward, backward = recorder.steps().content(), recorder.steps(backwards=True).content()
     for name, values in forward.items():
         if name.endswith("T_frame_camera"):
             np.testing.assert_allclose(backward[name], values, atol=1e-6)
         elif name.endswith(("intrinsics", "frame")):
             np.testing.assert_array_equal(backward[name], values)
-        else:
+        elif name not in ("joint_velocities", "contact_force"):
             np.testing.assert_array_equal(backward[name], values[::-1])
+
+
+def test_backwards_the_joints_move_the_opposite_way(recorder):
+    forward, backward = recorder.steps(), recorder.steps(backwards=True)
+    assert np.abs(forward.joint_velocities).max() > 0.01
+    np.testing.assert_array_equal(backward.joint_velocities, -forward.joint_velocities[::-1])
+    for steps in (forward, backward):
+        moved = np.diff(steps.joint_positions, axis=0)
+        fast = np.abs(moved) > 1e-4
+        assert fast.any()
+        np.testing.assert_array_equal(
+            np.sign(moved)[fast], np.sign(steps.joint_velocities[1:])[fast]
+        )
+
+
+def test_backwards_the_force_of_a_step_still_stands_at_the_step_s_end(recorder):
+    """The force 0, 1, 2, 3, 4 [N] was that of the steps before rows 0 to 4."""
+    np.testing.assert_array_equal(recorder.steps(backwards=True).contact_force, [0, 4, 3, 2, 1])
+
+
+def test_a_force_that_was_not_measured_is_not_measured_backwards_either(recorder, monkeypatch):
+    monkeypatch.setattr(recorder, "_force", [np.nan] * 5)
+    assert np.isnan(recorder.steps(backwards=True).contact_force).all()
 
 
 def test_intrinsics_are_those_of_the_recorded_image_size(recorder, peg_backend):

@@ -91,6 +91,7 @@ def test_a_demonstration_holds_every_step_s_arrays_bodies_and_state(peg_demonstr
     assert d.task_parameters == {"placement": Placement().to_json()}
     assert (d.task, d.robot, d.backend, d.seed) == ("peg_in_hole", "ur5e_2f85", "pybullet", 0)
     assert d.device == "scripted" and d.success[-1] and not d.success[0]
+    assert d.seconds == 0 and not d.steered_by_person
 
 
 def test_measured_poses_stay_near_the_commanded_ones(peg_demonstration):

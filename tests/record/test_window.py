@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from sart_toolkit.errors import MissingExtra, NoDisplay
+from sart_toolkit.errors import InvalidInput, MissingExtra, NoDisplay
 from sart_toolkit.record import screen as screens
 from sart_toolkit.record.desk import RecordingDesk
 from sart_toolkit.record.devices.keyboard import Keyboard
@@ -49,6 +49,12 @@ def test_a_machine_too_slow_runs_at_a_share_of_real_time_and_says_so():
     assert 0.4 < pace.share < 0.6
     passed(pace, clock, 3.0, 0.01)
     assert pace.share > 0.97
+
+
+def test_a_recording_without_a_camera_has_no_window(make_session, peg_setup):
+    desk = RecordingDesk(make_session(), Keyboard(peg_setup), print)
+    with pytest.raises(InvalidInput, match="no camera to show; record with one"):
+        RecordingWindow(desk, None, "demo.h5")
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ import pytest
 
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import Demonstration
+from sart_toolkit.data.storage import load_demonstration, save_demonstration
 from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import BrokenFile, CannotWrite, Mismatch, MissingFile
 from sart_toolkit.report import page as report
@@ -126,7 +127,9 @@ def test_page_tells_the_figures(page: Page) -> None:
         "peg_in_hole",
         "18 / 20",
         "90 %, Wilson 95 % interval 64 % to 95 %",
-        "4.2 s demonstrating, by scripted operator",
+        "41 steps over 4.0 s",
+        "steered by scripted operator",
+        "no demonstrating: a script steered",
         "no annotating: radii suggested by the toolkit",
         "4 min 50 s",
         "12 of 15 attempted trajectories were kept (80 %)",
@@ -246,7 +249,36 @@ def test_human_radii_count_as_human_time(run_dir: Path, edit_json: EditJson) -> 
     edit_json(path, {"seconds_spent": 30.0})
     page = written(run_dir)
     assert "30.0 s annotating" in page.text
-    assert "34.2 s" in page.text
+    assert "Human time30.0 s" in page.text
+
+
+def test_only_a_person_s_demonstration_counts_as_human_time(run_dir: Path) -> None:
+    assert "Human timenone" in written(run_dir).text
+    demonstration = load_demonstration(run_dir / "demo.h5")
+    by_hand = dataclasses.replace(demonstration, device="keyboard", operator="Ada", seconds=34.2)
+    save_demonstration(run_dir / "demo.h5", by_hand)
+    page = written(run_dir)
+    assert "Human time34.2 s" in page.text and "34.2 s demonstrating" in page.text
+    assert "steered by Ada" in page.text
+
+
+def test_a_video_that_ended_otherwise_than_its_rollout_says_so(
+    run_dir: Path, edit_json: EditJson
+) -> None:
+    path = "videos/success_000.mp4"
+    video = {"path": path, "episode": 3, "outcome": "success", "evaluated_outcome": "failure"}
+    edit_json(run_dir / "evaluation.json", {"videos": [video]})
+    words = "episode 3, run again for the video; when it was evaluated it was a failure"
+    assert words in written(run_dir).text
+
+
+def test_an_interrupted_generation_has_no_time_and_no_rate(
+    run_dir: Path, edit_json: EditJson
+) -> None:
+    assert "kept each second" in written(run_dir).text
+    edit_json(run_dir / "dataset" / "dataset.json", {"seconds": None})
+    text = written(run_dir).text
+    assert "were kept (80 %)." in text and "kept each second" not in text
 
 
 def test_hostile_text_stays_text(run_dir: Path, edit_json: EditJson) -> None:

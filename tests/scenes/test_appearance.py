@@ -1,6 +1,7 @@
 """Other appearance: within what was asked for, the same for a seed, and nothing else changes."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import distance
 from sart_toolkit.robots import get_robot
-from sart_toolkit.scenes.appearance import AppearanceConfig, randomise_appearance
+from sart_toolkit.scenes.appearance import Appearance, AppearanceConfig, randomise_appearance
 from sart_toolkit.tasks import TASKS, get_task
 
 
@@ -76,6 +77,33 @@ def test_a_state_is_restored_in_a_scene_of_another_appearance(name, peg_task):
     assert difference.mean() > 2
     plain.close()
     varied.close()
+
+
+def test_an_appearance_is_the_same_after_it_was_written_and_read(peg_task):
+    robot = get_robot(peg_task.robot)
+    appearance = Appearance((3, 1), AppearanceConfig(colour=0.3))
+    again = Appearance.from_json(json.loads(json.dumps(appearance.to_json())))
+    assert again == appearance
+    looks = [a.applied(robot, peg_task.scene) for a in (appearance, again)]
+    assert repr(looks[0]) == repr(looks[1])
+    assert repr(looks[0]) != repr(Appearance((3, 1)).applied(robot, peg_task.scene))
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("red", "appearance: expected seed and config"),
+        ({"seed": [0]}, "appearance: expected seed and config"),
+        ({"seed": [0], "config": {"colours": 1.0}}, "appearance: expected seed and config"),
+        ({"seed": [0], "config": {}, "more": 1}, "appearance: expected seed and config"),
+        ({"seed": [-1], "config": {}}, "seed: expected whole numbers >= 0"),
+        ({"seed": [0], "config": {"light": -1.0}}, "light: expected a finite number >= 0"),
+        ({"seed": [0], "config": {"light": "much"}}, "appearance: expected seed and config"),
+    ],
+)
+def test_a_noted_appearance_that_is_none_is_refused(value, message):
+    with pytest.raises(InvalidInput, match=message):
+        Appearance.from_json(value)
 
 
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(AppearanceConfig)])
