@@ -30,6 +30,7 @@ from sart_toolkit.data.records import (
     Referring,
     library_versions,
 )
+from sart_toolkit.data.schemas import DatasetFile, EvaluationFile, RunFile
 from sart_toolkit.data.storage import (
     check_writable,
     clear_directory,
@@ -699,7 +700,8 @@ def run(
             write_json(out / "run.json", state)
         _log.info("%-9s %6.1f s  %s", name, seconds, result)
     page = report(out)
-    figures, generated = read_json(evaluation), read_json(dataset / "dataset.json")
+    figures = read_json(evaluation, EvaluationFile)
+    generated = read_json(dataset / "dataset.json", DatasetFile)
     return {
         "task": found.name,
         "success": f"{figures['n_success']}/{figures['n_episodes']}",
@@ -725,7 +727,7 @@ def _resumed(out: Path, wanted: Mapping[str, Any], overwrite: bool) -> dict[str,
     if overwrite:
         clear_directory(out, "run.json", overwrite=True)
     elif (out / "run.json").exists():
-        state = read_json(out / "run.json")
+        state = read_json(out / "run.json", RunFile)
         if state["config"] != wanted:
             changed = [k for k, v in wanted.items() if state["config"].get(k) != v]
             raise Mismatch(

@@ -18,6 +18,7 @@ from sart_toolkit.cli.arguments import (
 from sart_toolkit.cli.console import ProgressDisplay, say, typed
 from sart_toolkit.cli.info import plain
 from sart_toolkit.data.records import library_versions
+from sart_toolkit.data.schemas import EvaluationFile
 from sart_toolkit.data.storage import check_writable, read_json, write_json
 from sart_toolkit.doctor import machine
 from sart_toolkit.robots import get_robot
@@ -200,7 +201,7 @@ def skill_verb(args: BenchmarkSkill) -> Result:
                 command=typed(),
                 progress=progress,
             )
-        evaluation = read_json(out / "evaluation.json")
+        evaluation = read_json(out / "evaluation.json", EvaluationFile)
         rows[name] = {
             key: evaluation[key] for key in ("n_success", "n_episodes", "success_rate", "ci95")
         } | {key: run[key] for key in ("kept", "attempted", "stages_seconds")}
