@@ -37,6 +37,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from sart_toolkit.backends.states import pack_state, unpack_state
 from sart_toolkit.data import storage
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import (
@@ -57,6 +58,7 @@ from sart_toolkit.poses import pose
 SECONDS, MEMORY_BYTES = 5.0, 500 * 10**6
 # How long nothing may come back before a process counts as hung.
 PATIENCE_SECONDS = 60.0
+HEAD = {"robot": "ur5e", "scene": "0" * 64, "bodies": ["peg"], "time": 0.5, "target": [0.0] * 6}
 REQUEST = {"tasks": ["peg_in_hole"], "seed": 0}
 GOOD = ("refused", "equal", "different, no hash covers")
 BAD = ("different, a hash covers", "foreign content", "untyped", "slow", "memory", "crashed")
@@ -69,6 +71,7 @@ Fingerprint = dict[str, Any]
 
 
 def make_steps(n: int, rng: Rng) -> Steps:
+    """Steps with small images, whose content packs well."""
     Ts = np.stack([pose(rng.uniform(-0.3, 0.3, 3), rng.uniform(-1, 1, 3)) for _ in range(n)])
     camera = CameraRecord(
         rgb=rng.integers(0, 255, (n, 16, 16, 3), np.uint8) // 64 * 64,
@@ -125,11 +128,14 @@ def make_files(root: Path) -> None:
     )
     make_skill(root / "skill", dataset)
     make_results(root)
+    (root / "saved state").mkdir()
+    (root / "saved state" / "a.state").write_bytes(pack_state("pybullet", HEAD, bytes(100)))
     (root / "urdf").mkdir()
     (root / "urdf" / "arm.urdf").write_text(ARM)
 
 
 def make_skill(path: Path, dataset: Any) -> None:
+    """An untrained skill, and a tensor file like a checkpoint."""
     import torch
 
     from sart_toolkit.learn.skill import save_skill
@@ -148,6 +154,7 @@ def make_skill(path: Path, dataset: Any) -> None:
 
 
 def make_results(root: Path) -> None:
+    """What an evaluation, a run and a benchmark leave."""
     rows = [
         {
             "episode": k,
@@ -229,20 +236,24 @@ def _plain(value: Any) -> Any:
 
 
 def read_demonstration(at: Path) -> Fingerprint:
+    """What a demonstration's file says."""
     found = storage.load_demonstration(at / "demo.h5")
     return {"covered": found.content_hash(), "rest": _other(found)}
 
 
 def read_annotation(at: Path) -> Fingerprint:
+    """What an annotation says."""
     found = storage.load_annotation(at / "annotation.json")
     return {"covered": None, "rest": found.content_hash()}
 
 
 def read_episode(at: Path) -> Fingerprint:
+    """What an episode's file says."""
     return {"covered": storage.load_episode(at / "episode.h5").content_hash(), "rest": None}
 
 
 def read_dataset(at: Path) -> Fingerprint:
+    """What a dataset says, every part of it read."""
     found = load_dataset(at)
     parts = [found.content_hash, [e.content_hash() for e in found]]
     rest = [dict(found.info)]
@@ -253,6 +264,7 @@ def read_dataset(at: Path) -> Fingerprint:
 
 
 def read_skill(at: Path) -> Fingerprint:
+    """What a skill says."""
     from sart_toolkit.learn.skill import load_skill
     from sart_toolkit.learn.tensorfile import tensors_digest
 
@@ -264,6 +276,7 @@ def read_skill(at: Path) -> Fingerprint:
 
 
 def read_tensors(at: Path) -> Fingerprint:
+    """What a tensor file says."""
     from sart_toolkit.learn.tensorfile import load_tensors, tensors_digest
 
     tensors, about = load_tensors(at / "a.safetensors")
@@ -271,6 +284,7 @@ def read_tensors(at: Path) -> Fingerprint:
 
 
 def read_evaluation(at: Path) -> Fingerprint:
+    """What a report and `sart info` read of a run."""
     from sart_toolkit.cli.info import without_rows
 
     evaluation = storage.read_json(at / "evaluation.json", EvaluationFile)
@@ -281,12 +295,21 @@ def read_evaluation(at: Path) -> Fingerprint:
 
 
 def read_result_log(at: Path) -> Fingerprint:
+    """What a benchmark that was interrupted left."""
     from sart_toolkit.benchmark.result_log import ResultLog
 
     return {"covered": None, "rest": ResultLog(at / "out.json", REQUEST, overwrite=False).rows}
 
 
+def read_state(at: Path) -> Fingerprint:
+    """What a saved state says, before a simulator has it."""
+    state = (at / "a.state").read_bytes()
+    head, world = unpack_state("pybullet", state, HEAD["robot"], HEAD["scene"], HEAD["bodies"])
+    return {"covered": None, "rest": [head, world.hex()]}
+
+
 def read_urdf(at: Path) -> Fingerprint:
+    """The robot that is made of a URDF."""
     from sart_toolkit.robots.model import RobotModel
     from sart_toolkit.robots.spec import CameraSpec, GripperSpec, RobotSpec
 
@@ -337,6 +360,7 @@ LOADERS = (
     Loader("tensors", read_tensors),
     Loader("evaluation", read_evaluation),
     Loader("result log", read_result_log),
+    Loader("saved state", read_state),
     Loader("urdf", read_urdf),
 )
 
@@ -349,6 +373,7 @@ def _place(rng: Rng, n: int) -> int:
 
 
 def mutate_bytes(content: bytes, rng: Rng) -> tuple[str, bytes]:
+    """Some bytes changed, lost, added or exchanged."""
     data, n = bytearray(content), len(content)
     at, size = _place(rng, n), int(rng.choice([1, 2, 4, 8, 64, 512, 4096]))
     other = _place(rng, n)
@@ -386,8 +411,8 @@ def mutate_bytes(content: bytes, rng: Rng) -> tuple[str, bytes]:
 # --- mutations of JSON -------------------------------------------------------------------------
 
 _ODD = (
-    None, True, False, 0, -1, 10**18, 10**400, -(10**30), 0.5, 1e308, "", "text", "../../etc/passwd",
-    "/etc/passwd", "a\0b", "..", "\ud800", "NaN", [], {}, [[]], {"": {}}, [None] * 50, "x" * 100_000,
+    None, True, False, 0, -1, 10**18, 10**400, -(10**30), 0.5, 1e308, "", "text", "../../etc/hosts",
+    "/etc/hosts", "a\0b", "..", "\ud800", "NaN", [], {}, [[]], {"": {}}, [None] * 50, "x" * 10**5,
 )  # fmt: skip
 _RAW = ("NaN", "Infinity", "-Infinity", "1e999", "[" * 100_000, '{"a":' * 50_000, "1" * 5000)
 
@@ -438,6 +463,7 @@ def mutate_json(value: Any, rng: Rng) -> tuple[str, str | Any]:
 
 
 def mutate_json_file(path: Path, rng: Rng) -> tuple[str, bool]:
+    """Change one place of a JSON file."""
     sealed = path.name != "annotation.json"
     kind, value = mutate_json(json.loads(path.read_text()), rng)
     forged = bool(rng.integers(2)) and sealed and not isinstance(value, str)
@@ -445,10 +471,12 @@ def mutate_json_file(path: Path, rng: Rng) -> tuple[str, bool]:
         with contextlib.suppress(ValueError, RecursionError):
             value = storage.with_seal(value)
     path.write_text(value if isinstance(value, str) else json.dumps(value))
-    return f"json {kind}" + (", forged" if forged else ""), forged
+    # No hash covers what a person may edit.
+    return f"json {kind}" + (", forged" if forged else ""), forged or not sealed
 
 
 def mutate_lines(path: Path, rng: Rng) -> tuple[str, bool]:
+    """Change, lose, repeat or exchange a line."""
     lines = path.read_bytes().splitlines(keepends=True)
     i, kind = _place(rng, len(lines)), str(rng.choice(["row", "drop", "twice", "swap", "cut"]))
     forged = False
@@ -623,6 +651,7 @@ def mutate_hdf5(path: Path, rng: Rng) -> tuple[str, bool]:
 
 
 def mutate_tensors(path: Path, rng: Rng) -> tuple[str, bool]:
+    """Change the length, header or weights of a tensor file."""
     content = path.read_bytes()
     n = int.from_bytes(content[:8], "little")
     kind = str(rng.choice(["length", "header", "weight"]))
@@ -644,6 +673,16 @@ def mutate_tensors(path: Path, rng: Rng) -> tuple[str, bool]:
     return f"tensors {kind}", False
 
 
+def mutate_state(path: Path, rng: Rng) -> tuple[str, bool]:
+    """Change what a saved state says of itself, and make its hash fit again."""
+    kind, value = mutate_json(HEAD, rng)
+    text = value if isinstance(value, str) else json.dumps(value)
+    magic = path.read_bytes().split(b"\n")[0] + b"\n"
+    body = text.encode() + b"\n" + bytes(100)
+    path.write_bytes(magic + hashlib.sha256(body).digest() + body)
+    return f"state {kind}, forged", True
+
+
 _WORDS = (
     "",
     "inf",
@@ -661,6 +700,7 @@ _WORDS = (
 
 
 def mutate_urdf(path: Path, rng: Rng) -> tuple[str, bool]:
+    """Change, lose, repeat or move one element or attribute."""
     root = ET.fromstring(path.read_text())
     parents = {child: parent for parent in root.iter() for child in parent}
     elements = list(parents)
@@ -695,6 +735,7 @@ def mutate(directory: Path, rng: Rng) -> tuple[str, bool]:
         ".h5": mutate_hdf5,
         ".safetensors": mutate_tensors,
         ".urdf": mutate_urdf,
+        ".state": mutate_state,
     }[path.suffix]
     if rng.integers(5) < 3:
         what, forged = special(path, rng)
@@ -727,6 +768,7 @@ def _out_of_memory(error: BaseException) -> bool:
 
 
 def same(a: Any, b: Any) -> bool:
+    """Whether two fingerprints say the same."""
     return digest({"": a}) == digest({"": b})
 
 
@@ -783,10 +825,8 @@ class Bench:
         whole = self.whole[loader.name]
         if any(f"hdf5 {kind}," in what for kind in _FOREIGN):
             # Unless HDF5 itself couldn't do it.
-            changed = b"stranger" in b"".join(
-                p.read_bytes() for p in (self.root / "damaged").rglob("*.h5")
-            )
-            if changed:
+            content = b"".join(p.read_bytes() for p in (self.root / "damaged").rglob("*.h5"))
+            if b"stranger" in content or b"/aside" in content:
                 return "foreign content"
         if same(found, whole):
             return "equal"
@@ -853,7 +893,9 @@ class Process:
             while i < last:
                 line = self._line(PATIENCE_SECONDS)
                 if line is None:
-                    ended = self._process.poll()
+                    ended = None
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        ended = self._process.wait(1.0)
                     self.close()
                     yield {
                         "i": i,
@@ -879,6 +921,7 @@ class Process:
 
 
 def summary(rows: Iterator[dict[str, Any]], progress: Callable[[int], None]) -> dict[str, Any]:
+    """How the mutations of each loader ended."""
     names = [loader.name for loader in LOADERS]
     tables: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
     slowest: dict[str, float] = collections.defaultdict(float)
@@ -904,6 +947,7 @@ def summary(rows: Iterator[dict[str, Any]], progress: Callable[[int], None]) -> 
 
 
 def print_table(found: dict[str, Any]) -> None:
+    """Print `summary` by loader."""
     columns = ("mutations", *GOOD, *BAD, "slowest_s")
     print("loader".ljust(14), *(column.rjust(len(column)) for column in columns), sep="  ")
     for name, row in found["loaders"].items():
@@ -911,6 +955,7 @@ def print_table(found: dict[str, Any]) -> None:
 
 
 def main() -> int:
+    """The exit status: 1 where something failed."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--count", type=int, default=1000, help="how many mutations")
     parser.add_argument("--seed", type=int, default=0)

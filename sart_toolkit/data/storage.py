@@ -700,11 +700,10 @@ def _unpacked_states(sizes: Sequence[int], packed: bytes) -> tuple[bytes, ...]:
     for size in sizes:
         state = b""
         while len(state) < size:
-            more = unpacker.decompress(packed, max_length=size - len(state))
-            packed = b""
-            if not more and (unpacker.needs_input or unpacker.eof):
+            if unpacker.eof or (unpacker.needs_input and not packed):
                 raise ValueError("states: end before their sizes say so")
-            state += more
+            state += unpacker.decompress(packed, max_length=size - len(state))
+            packed = b""
         states.append(state)
     # What is left is the stream's own end.
     if not unpacker.eof and unpacker.decompress(packed, max_length=1):

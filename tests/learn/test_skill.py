@@ -327,12 +327,12 @@ def test_weights_that_are_no_finite_numbers_are_neither_saved_nor_loaded(
     tensors, _ = load_tensors(path / "model.safetensors")
     name = next(name for name, tensor in tensors.items() if tensor.is_floating_point())
     for value in (torch.nan, torch.inf):
-        tensors[name].view(-1)[0] = value
+        tensors[name].reshape(-1)[0] = value
         _write_weights(path, tensors)
         with pytest.raises(BrokenFile, match=f"weight '{name}' has NaN or infinite values"):
             load_skill(path)
         with torch.no_grad():
-            next(result.policy.parameters()).view(-1)[0] = value
+            next(result.policy.parameters()).fill_(value)
         with pytest.raises(InvalidInput, match="has NaN or infinite values, so it can't be saved"):
             save_skill(tmp_path / "new", result, dataset)
     assert not (tmp_path / "new" / "config.json").exists()
