@@ -21,12 +21,15 @@ import functools
 import hashlib
 import json
 import os
+import queue
 import resource
 import select
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import xml.etree.ElementTree as ET
@@ -49,6 +52,7 @@ from sart_toolkit.data.records import (
     Provenance,
     Steps,
     digest,
+    library_versions,
 )
 from sart_toolkit.data.schemas import EvaluationFile, RunFile, TrainingFile
 from sart_toolkit.data.writer import write_dataset
@@ -58,6 +62,7 @@ from sart_toolkit.poses import pose
 SECONDS, MEMORY_BYTES = 5.0, 500 * 10**6
 # How long nothing may come back before a process counts as hung.
 PATIENCE_SECONDS = 60.0
+CHUNK = 200
 HEAD = {"robot": "ur5e", "scene": "0" * 64, "bodies": ["peg"], "time": 0.5, "target": [0.0] * 6}
 REQUEST = {"tasks": ["peg_in_hole"], "seed": 0}
 GOOD = ("refused", "equal", "different, no hash covers")
@@ -920,19 +925,57 @@ class Process:
                 pipe.close()
 
 
+def all_rows(seed: int, count: int, workers: int) -> Iterator[dict[str, Any]]:
+    """What comes of the first `count` mutations, in any order."""
+    chunks, found = iter(range(0, count, CHUNK)), queue.SimpleQueue[dict[str, Any] | None]()
+    lock, processes = threading.Lock(), [Process() for _ in range(workers)]
+
+    def work(process: Process) -> None:
+        try:
+            while True:
+                with lock:
+                    first = next(chunks, None)
+                if first is None:
+                    return
+                for row in process.rows(seed, first, min(first + CHUNK, count)):
+                    found.put(row)
+        finally:
+            found.put(None)
+
+    try:
+        for process in processes:
+            threading.Thread(target=work, args=[process], daemon=True).start()
+        at_work = workers
+        while at_work:
+            row = found.get()
+            if row is None:
+                at_work -= 1
+            else:
+                yield row
+    finally:
+        for process in processes:
+            process.close()
+
+
 def summary(rows: Iterator[dict[str, Any]], progress: Callable[[int], None]) -> dict[str, Any]:
     """How the mutations of each loader ended."""
     names = [loader.name for loader in LOADERS]
     tables: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
     slowest: dict[str, float] = collections.defaultdict(float)
     failures = []
-    for done, row in enumerate(rows, 1):
-        tables[row["loader"]][row["outcome"]] += 1
-        slowest[row["loader"]] = max(slowest[row["loader"]], row["seconds"])
-        if row["outcome"] in BAD:
-            failures.append(row)
-        progress(done)
+    done = 0
+    # Interrupted, it says what came of those that were done.
+    with contextlib.suppress(KeyboardInterrupt):
+        for row in rows:
+            tables[row["loader"]][row["outcome"]] += 1
+            slowest[row["loader"]] = max(slowest[row["loader"]], row["seconds"])
+            if row["outcome"] in BAD:
+                failures.append(row)
+            done += 1
+            progress(done)
+    failures.sort(key=lambda row: row["i"])
     return {
+        "count": done,
         "loaders": {
             name: {
                 "mutations": tables[name].total(),
@@ -959,6 +1002,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--count", type=int, default=1000, help="how many mutations")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument(
         "--only", type=int, help="do this one again, here, and show what comes of it"
     )
@@ -974,17 +1018,18 @@ def main() -> int:
             row = Bench(Path(directory)).run(args.seed, args.only)
         print(json.dumps(row, indent=2))
         return int(row["outcome"] in BAD)
-    process, started = Process(), time.monotonic()
+    started = time.monotonic()
+    # Ctrl-C interrupts, also in the background of a script.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def progress(done: int) -> None:
         if done % 1000 == 0:
             print(f"{done}/{args.count}, {time.monotonic() - started:.0f} s", file=sys.stderr)
 
-    try:
-        found = summary(process.rows(args.seed, 0, args.count), progress)
-    finally:
-        process.close()
-    found = {"count": args.count, "seed": args.seed, **found}
+    rows = all_rows(args.seed, args.count, args.workers)
+    with contextlib.closing(rows):
+        found = {"seed": args.seed, **summary(rows, progress)}
+    found["versions"] = library_versions()
     if args.out is not None:
         storage.write_json(args.out, found)
     print_table(found)

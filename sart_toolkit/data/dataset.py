@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sart_toolkit.data.manifest import Manifest, entry_of, source_name
+from sart_toolkit.data.manifest import Manifest, source_name
 from sart_toolkit.data.records import Annotation, Demonstration, Episode
 from sart_toolkit.data.schemas import DatasetFile
 from sart_toolkit.data.storage import (
@@ -123,11 +123,6 @@ class Dataset:
         """
         entry = self.index[i]
         episode = load_episode(self.path / entry.name, entry.content_hash)
-        if entry_of(episode, entry.content_hash) != entry:
-            raise BrokenFile(
-                f"{self.path / entry.name}: differs from what the manifest says of it; "
-                "generate it again"
-            )
         if episode.provenance.demonstration_hash != self.sources[entry.source].demonstration_hash:
             raise Mismatch(
                 f"{self.path}: {entry.name} was generated from another demonstration; "

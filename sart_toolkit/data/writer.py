@@ -80,9 +80,9 @@ class EpisodeFiles:
         """Whether an episode's file is there and whole, and what the entry says."""
         try:
             episode = load_episode(self._path / entry.name, entry.content_hash)
+            return entry_of(episode, entry.content_hash) == entry
         except SartError:
             return False
-        return entry_of(episode, entry.content_hash) == entry
 
 
 class DatasetWriter:
