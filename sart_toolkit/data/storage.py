@@ -537,7 +537,8 @@ def _check_bytes(path: Path, kind: str) -> str:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         n_bytes = file.tell() - _BLOCK
     if block != _header(kind, n_bytes, sha256):
-        what = "truncated" if n_bytes != about.get("bytes") else "content differs from its hash"
+        cut = n_bytes != about.get("bytes")
+        what = f"truncated or not a {kind} file" if cut else "content differs from its hash"
         raise BrokenFile(f"{path}: {what}; restore a copy or make it again")
     return sha256
 

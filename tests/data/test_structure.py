@@ -60,7 +60,7 @@ def test_one_flipped_bit_anywhere_in_a_file_is_refused(path, tmp_path):
 def test_bytes_that_were_not_written_never_reach_the_hdf5_library(path, monkeypatch):
     path.write_bytes(path.read_bytes()[:-1] + b"\0\0")
     monkeypatch.setattr(h5py, "File", None)
-    with pytest.raises(BrokenFile, match="truncated; restore a copy"):
+    with pytest.raises(BrokenFile, match="truncated or not a demonstration file; restore a copy"):
         load_demonstration(path)
 
 
