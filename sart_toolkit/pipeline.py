@@ -31,6 +31,7 @@ from sart_toolkit.data.records import (
     Referring,
     library_versions,
 )
+from sart_toolkit.data.schemas import DatasetFile, EvaluationFile, RunFile
 from sart_toolkit.data.storage import (
     OutputLock,
     check_writable,
@@ -43,7 +44,7 @@ from sart_toolkit.data.storage import (
     write_json,
 )
 from sart_toolkit.doctor import machine
-from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, UnknownName
+from sart_toolkit.errors import InvalidInput, Mismatch, MissingFile, UnknownName
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.record.devices import DEVICES, make_device
 from sart_toolkit.registry import check_known, reference_to
@@ -803,35 +804,20 @@ def run(
             write_json(out / "run.json", state)
         _log.info("%-9s %6.1f s  %s", name, seconds, result)
     page = report(out)
-    successes, of, rate, ci95 = _read_fields(
-        evaluation, "n_success", "n_episodes", "success_rate", "ci95"
-    )
-    kept, attempted = _read_fields(dataset / "dataset.json", "n_kept", "n_attempted")
+    figures = read_json(evaluation, EvaluationFile)
+    generated = read_json(dataset / "dataset.json", DatasetFile)
     return {
         "task": found.name,
-        "success": f"{successes}/{of}",
-        "success_rate": rate,
-        "ci95": ci95,
-        "kept": kept,
-        "attempted": attempted,
+        "success": f"{figures['n_success']}/{figures['n_episodes']}",
+        "success_rate": figures["success_rate"],
+        "ci95": figures["ci95"],
+        "kept": generated["n_kept"],
+        "attempted": generated["n_attempted"],
         "stages_seconds": {k: round(v, 1) for k, v in state["stages"].items()},
         "seconds": round(sum(state["stages"].values()), 1),
         "skill": str(skill),
         "report": str(page),
     }
-
-
-def _read_fields(path: Path, *names: str) -> list[Any]:
-    """What a JSON file has under names.
-
-    Raises:
-        MissingFile, BrokenFile: the file can't be read, or has no such name.
-    """
-    value = read_json(path)
-    for name in names:
-        if name not in value:
-            raise BrokenFile(f"{path}: has no {name}; remove it to have it made again")
-    return [value[name] for name in names]
 
 
 def _named(kind: str, given: Any, found: Any) -> str:
@@ -845,21 +831,14 @@ def _resumed(out: Path, wanted: Mapping[str, Any], overwrite: bool) -> dict[str,
     if overwrite:
         clear_directory(out, "run.json", overwrite=True)
     elif (out / "run.json").exists():
-        config, stages = _read_fields(out / "run.json", "config", "stages")
-        if not isinstance(config, dict) or not isinstance(stages, dict) or not all(
-            isinstance(seconds, int | float) for seconds in stages.values()
-        ):  # fmt: skip
-            raise BrokenFile(
-                f"{out / 'run.json'}: expected settings in config and the seconds of each stage "
-                "in stages; add --overwrite or choose another --out"
-            )
-        if config != wanted:
-            changed = [k for k, v in wanted.items() if config.get(k) != v]
+        state = read_json(out / "run.json", RunFile)
+        if state["config"] != wanted:
+            changed = [k for k, v in wanted.items() if state["config"].get(k) != v]
             raise Mismatch(
                 f"{out}: holds a run with another {', '.join(changed)}; add --overwrite or choose "
                 "another --out"
             )
-        return {"config": config, "stages": stages}
+        return {"config": state["config"], "stages": state["stages"]}
     else:
         check_writable(out)
     return {"config": wanted, "stages": {}}

@@ -103,10 +103,10 @@ NOTED = {
 def test_each_file_notes_what_it_was_made_with(there):
     assert load_demonstration(there / "demo.h5").references == NOTED
     assert load_demonstration(there / "data" / "sources" / "demo00" / "demo.h5").references == NOTED
-    info = read_json(there / "data" / "dataset.json")
+    info = read_json(there / "data" / "dataset.json", dict)
     assert info["references"] == NOTED
     assert info["config"]["strategy"] == "my_things.py:INSIDE"
-    config = read_json(there / "skill" / "config.json")
+    config = read_json(there / "skill" / "config.json", dict)
     assert config["references"] == NOTED
     assert config["training"]["policy"] == "my_things.py:MyPolicy"
 
@@ -173,7 +173,7 @@ def test_a_whole_run_takes_objects_and_resumes(there, tmp_path, caplog):
     result = sart.run(mine, tmp_path / "run", **given, progress=lambda stage, *_: heard.add(stage))
     assert heard == {"record", "suggest", "augment", "read", "train", "evaluate"}
     assert result["task"] == "drawer" and result["kept"] == 2
-    config = read_json(tmp_path / "run" / "run.json")["config"]
+    config = read_json(tmp_path / "run" / "run.json", dict)["config"]
     assert {kind: config[kind] for kind in NOTED} == NOTED
     (tmp_path / "run" / "evaluation.json").unlink()
     caplog.clear()

@@ -69,7 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         get_task(options.task)
         for folder in (options.directory, images):
             folder.mkdir(parents=True, exist_ok=True)
-        report: dict[str, Any] = read_json(report_file) if report_file.exists() else {"stages": {}}
+        report: dict[str, Any] = (
+            read_json(report_file, dict) if report_file.exists() else {"stages": {}}
+        )
         report |= {
             "task": options.task,
             "machine": doctor.machine(),

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from sart_toolkit.data.schemas import StateHead
+from sart_toolkit.data.storage import check_values, parse_json
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.spec import SceneSpec
@@ -71,9 +73,10 @@ def unpack_state(
         if hashlib.sha256(body).digest() != sha:
             raise ValueError("damaged")
         head_line, payload = body.split(b"\n", 1)
-        head: dict[str, Any] = json.loads(head_line)
     except ValueError as error:
         raise BrokenFile(f"saved state: {error}; record the demonstration again") from error
+    head: dict[str, Any] = parse_json(head_line, "saved state")
+    check_values(head, StateHead, "saved state")
     if head["scene"] != scene:
         raise BrokenFile(
             f"saved state: of robot {head['robot']!r} with {head['bodies']}, this backend has "

@@ -18,6 +18,7 @@ from sart_toolkit.cli.arguments import (
 from sart_toolkit.cli.console import ProgressDisplay, say, typed
 from sart_toolkit.cli.info import plain
 from sart_toolkit.data.records import library_versions
+from sart_toolkit.data.schemas import EvaluationFile
 from sart_toolkit.data.storage import OutputLock, check_writable, read_json, write_json
 from sart_toolkit.doctor import machine
 from sart_toolkit.errors import InvalidInput
@@ -231,7 +232,7 @@ def _skills(args: BenchmarkSkill, pairs: list[tuple[str, str]]) -> Result:
                 command=typed(),
                 progress=progress,
             )
-        evaluation = read_json(out / "evaluation.json")
+        evaluation = read_json(out / "evaluation.json", EvaluationFile)
         rows[name] = {
             key: evaluation[key] for key in ("n_success", "n_episodes", "success_rate", "ci95")
         } | {key: run[key] for key in ("kept", "attempted", "stages_seconds")}

@@ -12,8 +12,10 @@ import numpy as np
 from sart_toolkit.cli.arguments import Info
 from sart_toolkit.data.dataset import MANIFEST, Dataset, load_dataset
 from sart_toolkit.data.records import Demonstration
-from sart_toolkit.data.storage import load_annotation, load_recording, read_json
+from sart_toolkit.data.schemas import EvaluationFile, RunFile
+from sart_toolkit.data.storage import annotation_from_json, load_recording, read_json
 from sart_toolkit.errors import BrokenFile, MissingFile
+from sart_toolkit.learn.skillfiles import load_files
 from sart_toolkit.robots import ROBOTS, get_robot
 from sart_toolkit.tasks import TASKS, get_task
 
@@ -28,31 +30,42 @@ def info_verb(args: Info) -> dict[str, Any]:
         raise MissingFile(f"{path}: no such file or directory; check the path")
     if path.is_dir():
         if (path / "run.json").exists():
-            state = read_json(path / "run.json")
+            state = read_json(path / "run.json", RunFile)
             return {"kind": "run", **state["config"], "stages": state["stages"]}
         if (path / "model.safetensors").exists():
-            return {"kind": "skill", **describe_skill(path)}
+            return {"kind": "skill", **describe_skill(path), "hash_checked": "yes, of every file"}
         if (path / MANIFEST).exists():
-            return {"kind": "dataset", **describe_dataset(load_dataset(path))}
+            described = describe_dataset(load_dataset(path))
+            checked = "of dataset.json and manifest.jsonl; of each other file when it is read"
+            return {"kind": "dataset", **described, "hash_checked": checked}
         raise BrokenFile(f"{path}: holds no run, skill or dataset; pass another directory")
     if path.suffix == ".json":
-        value = read_json(path)
+        value = read_json(path, dict, sealed=False)
         if "spheres" in value:
-            spheres = load_annotation(path).spheres
+            spheres = annotation_from_json(value, path).spheres
             return {
                 "kind": "annotation",
                 "demonstration": value["demonstration_hash"],
                 "spheres": [
                     f"waypoint {s.waypoint}: {s.radius * 1e3:.1f} mm ({s.source})" for s in spheres
                 ],
+                "hash_checked": "no, a person may edit it; where it is used, that it names its "
+                "demonstration",
             }
         if "success_rate" in value:
-            return {"kind": "evaluation", **without_rows(value)}
+            value = read_json(path, EvaluationFile)
+            return {"kind": "evaluation", **without_rows(value), "hash_checked": "yes"}
         raise BrokenFile(f"{path}: neither an annotation nor an evaluation; pass another file")
     recording = load_recording(path)
     if isinstance(recording, Demonstration):
-        return {"kind": "demonstration", **describe_demonstration(recording), **_checked(recording)}
-    return {"kind": "episode", "steps": len(recording), **plain(recording.provenance)}
+        described = {**describe_demonstration(recording), **_checked(recording)}
+        return {"kind": "demonstration", **described, "hash_checked": "yes"}
+    return {
+        "kind": "episode",
+        "steps": len(recording),
+        **plain(recording.provenance),
+        "hash_checked": "yes",
+    }
 
 
 def describe_demonstration(
@@ -107,14 +120,15 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         "content_hash",
     )
     clearance = dataset.info.get("least_commanded_clearance_m")
-    return {k: dataset.info[k] for k in keys} | {
+    return {k: dataset.info.get(k) for k in keys} | {
         "least_commanded_clearance_mm": None if clearance is None else 1e3 * clearance
     }
 
 
 def describe_skill(path: Path) -> dict[str, Any]:
-    """A skill's directory in a few words, from its JSON alone."""
-    config, training = read_json(path / "config.json"), read_json(path / "training.json")
+    """A skill's directory in a few words, its files compared with their hashes."""
+    files = load_files(path)
+    config, training = files.config, files.training
     try:
         return {
             "task": config["task"],

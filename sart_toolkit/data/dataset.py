@@ -13,6 +13,7 @@ from typing import Any
 
 from sart_toolkit.data.manifest import Manifest, source_name
 from sart_toolkit.data.records import Annotation, Demonstration, Episode
+from sart_toolkit.data.schemas import DatasetFile
 from sart_toolkit.data.storage import (
     load_annotation,
     load_demonstration,
@@ -150,10 +151,11 @@ def load_dataset(path: Path) -> Dataset:
         raise MissingFile(f"{path}: no such dataset directory; make it with `sart augment`")
     if not (path / SUMMARY).exists() and (path / MANIFEST).exists():
         raise BrokenFile(f"{path}: generation was interrupted; run `sart augment` again to resume")
-    info = read_json(path / SUMMARY)
+    info = read_json(path / SUMMARY, DatasetFile)
     if not (path / MANIFEST).exists():
         raise MissingFile(f"{path / MANIFEST}: no such file; restore a copy or generate again")
     manifest = Manifest.from_rows(path / MANIFEST, read_json_lines(path / MANIFEST))
-    if info.get("content_hash") != manifest.content_hash():
+    hashes = (manifest.content_hash(), manifest.whole_hash())
+    if (info["content_hash"], info.pop("manifest_hash")) != hashes:
         raise BrokenFile(f"{path}: content differs from its hash; generate it again")
     return Dataset(path, info, manifest)

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sart_toolkit.data.records import digest
-from sart_toolkit.data.storage import SCHEMA_VERSION, check_schema
+from sart_toolkit.data.records import Episode, digest
+from sart_toolkit.data.schemas import ManifestHead, ManifestRow
+from sart_toolkit.data.storage import SCHEMA_VERSION, check_schema, check_values
 from sart_toolkit.errors import BrokenFile
 
 KEPT = "kept"
@@ -74,6 +75,23 @@ def episode_name(key: AttemptKey) -> str:
     return f"episodes/{source_name(key.source)}/sphere{key.sphere:02d}_k{key.k:05d}.h5"
 
 
+def entry_of(episode: Episode, content_hash: str) -> EpisodeEntry:
+    """What the index says of an episode that has this hash.
+
+    Raises:
+        BrokenFile: its certificate doesn't say what it proves.
+    """
+    p = episode.provenance
+    try:
+        clearance = float(p.certificate["commanded"]["clearance"]) if p.certificate else None
+    except (KeyError, TypeError, ValueError) as error:
+        raise BrokenFile(
+            f"certificate of the episode {episode_name(AttemptKey(p.source, p.sphere, p.k))}: "
+            f"{error!r} is missing or wrong; generate it again"
+        ) from error
+    return EpisodeEntry(p.source, p.sphere, p.k, len(episode), content_hash, clearance)
+
+
 @dataclass
 class Manifest:
     """What a dataset was asked for, and how its attempts ended.
@@ -96,19 +114,13 @@ class Manifest:
         """
         head, *attempts = rows or [{}]
         check_schema(path, head.get("schema_version"))
-        try:
-            manifest = cls(
-                tuple(
-                    (str(row["demonstration"]), str(row["annotation"])) for row in head["sources"]
-                ),
-                dict(head["request"]),
-            )
-            for row in attempts:
-                manifest.add(row)
-        except (KeyError, TypeError, ValueError) as error:
-            raise BrokenFile(
-                f"{path}: {error!r}: a field is missing or wrong; restore a copy or generate again"
-            ) from error
+        found: ManifestHead = check_values(head, ManifestHead, str(path))
+        manifest = cls(
+            tuple((source.demonstration, source.annotation) for source in found.sources),
+            found.request,
+        )
+        for i, row in enumerate(attempts, 2):
+            manifest._add(check_values(row, ManifestRow, f"{path}, line {i}"), f"{path}, line {i}")
         return manifest
 
     def head(self) -> dict[str, Any]:
@@ -123,23 +135,32 @@ class Manifest:
         }
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Take a row of `kept_row` or `rejected_row` in."""
-        key = AttemptKey(int(row["source"]), int(row["sphere"]), int(row["k"]))
+        """Take a row of `kept_row` or `rejected_row` in.
+
+        Raises:
+            BrokenFile: it is no such row.
+        """
+        self._add(check_values(row, ManifestRow, "manifest"), "manifest")
+
+    def _add(self, row: ManifestRow, what: str) -> None:
+        key = AttemptKey(row.source, row.sphere, row.k)
         self.kept.pop(key, None)
         self.rejected.pop(key, None)
-        if row["outcome"] != KEPT:
-            self.rejected[key] = Rejection(
-                str(row["outcome"]), str(row.get("detail", "")), _number(row.get("seconds"))
+        if row.source >= len(self.sources):
+            raise BrokenFile(
+                f"{what}: source {row.source} of {len(self.sources)}: a field is missing or wrong; "
+                "restore a copy or generate again"
             )
+        if row.outcome != KEPT:
+            self.rejected[key] = Rejection(row.outcome, row.detail, row.seconds)
             return
-        if not 0 <= key.source < len(self.sources):
-            raise ValueError(f"source {key.source} of {len(self.sources)}")
+        if row.steps is None or row.content_hash is None:
+            raise BrokenFile(
+                f"{what}: a kept episode has steps and content_hash, a field is missing or wrong; "
+                "restore a copy or generate again"
+            )
         self.kept[key] = EpisodeEntry(
-            *key,
-            int(row["steps"]),
-            str(row["content_hash"]),
-            _number(row.get("clearance_m")),
-            _number(row.get("seconds")),
+            *key, row.steps, row.content_hash, row.clearance_m, row.seconds
         )
 
     @property
@@ -159,6 +180,12 @@ class Manifest:
                 "episodes": [entry.content_hash for entry in self.index()],
             }
         )
+
+    def whole_hash(self) -> str:
+        """SHA-256 over everything in it, each attempt's last row, whatever their order."""
+        kept = [kept_row(self.kept[key]) for key in sorted(self.kept)]
+        rejected = [rejected_row(key, self.rejected[key]) for key in sorted(self.rejected)]
+        return digest({"head": self.head(), "kept": kept, "rejected": rejected})
 
 
 def kept_row(entry: EpisodeEntry) -> dict[str, Any]:
@@ -180,7 +207,3 @@ def rejected_row(key: AttemptKey, rejection: Rejection) -> dict[str, Any]:
 
 def _noted(**fields: Any) -> dict[str, Any]:
     return {name: value for name, value in fields.items() if value is not None}
-
-
-def _number(value: Any) -> float | None:
-    return None if value is None else float(value)

@@ -356,7 +356,11 @@ class Demonstration(Referring):
         )
 
     def content_hash(self) -> str:
-        """SHA-256 over the recording: steps, bodies, commands, task, robot; not saved states."""
+        """SHA-256 over the recording: all that proofs and policies rely on.
+
+        Not over who made it, when, with which versions, and where its robot, task and backend are
+        found: what was recorded stays the same. Its file has a hash over these, too.
+        """
         return digest(
             {
                 **self.steps.content(),
@@ -369,6 +373,9 @@ class Demonstration(Referring):
                 "task": self.task,
                 "task_parameters": dict(self.task_parameters),
                 "robot": self.robot,
+                "backend": self.backend,
+                "judged_by": self.judged_by,
+                "states": [hashlib.sha256(state).hexdigest() for state in self.states],
             }
         )
 

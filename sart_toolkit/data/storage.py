@@ -1,7 +1,9 @@
 """The only place that reads or writes files of ours: HDF5 for arrays, JSON for the rest.
 
 Every write goes to a temporary name beside its target, is flushed to disk and then renamed, so a
-reader sees the old file or the whole new one.
+reader sees the old file or the whole new one. What is written carries a SHA-256 that is compared
+before anything of it is used; it finds damage and mix-ups, not someone who computes it anew. What
+an annotation holds is a person's to edit, so it alone has none; a dataset and a skill have it.
 """
 
 from __future__ import annotations
@@ -9,30 +11,37 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import hashlib
 import io
 import json
 import lzma
 import os
 import re
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+import typing
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import h5py
+import msgspec
 import numpy as np
 
 from sart_toolkit.data.records import (
     Annotation,
+    CameraFrame,
     CameraRecord,
     Demonstration,
     Episode,
     PrecisionSphere,
     Provenance,
-    Rates,
     Steps,
+    digest,
 )
+from sart_toolkit.data.schemas import AnnotationFile, Matrix, References
+from sart_toolkit.data.structure import inspect
 from sart_toolkit.errors import (
     BrokenFile,
     CannotWrite,
@@ -42,7 +51,11 @@ from sart_toolkit.errors import (
     SartError,
 )
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
+
+# The largest files that are read as JSON, and as lines of JSON.
+MAX_JSON_BYTES = 16 * 2**20
+MAX_LINES_BYTES = 256 * 2**20
 
 # As `replacing` names them, with the eight characters of `mkstemp`.
 _TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}(\.(?!lock)\w+)?")
@@ -120,40 +133,142 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write a JSON object, with its `schema_version`, whole or not at all.
+def write_json(path: Path, value: Mapping[str, Any], sealed: bool = True) -> None:
+    """Write a JSON object, with its `schema_version` and a hash of it, whole or not at all.
+
+    Args:
+        path: the file.
+        value: what it is to hold.
+        sealed: whether it has the hash; not where a person may edit it.
 
     Raises:
         CannotWrite: the disk refuses.
         InvalidInput: a number is NaN or infinite, or a value isn't JSON.
     """
+    value = {"schema_version": SCHEMA_VERSION, **value}
     try:
-        text = json.dumps({"schema_version": SCHEMA_VERSION, **value}, indent=2, allow_nan=False)
+        # Names become text, which sorts otherwise than numbers.
+        value = json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as error:
         raise InvalidInput(f"{path}: can't be written as JSON: {error}") from error
-    write_text(path, text + "\n")
+    write_text(path, json.dumps(with_seal(value) if sealed else value, indent=2) + "\n")
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in a file of ours, without its `schema_version`.
+def with_seal(value: Mapping[str, Any]) -> dict[str, Any]:
+    """A JSON object with the hash of all else in it, as `read_json` expects it."""
+    rest = {name: inside for name, inside in value.items() if name != "sha256"}
+    return {**rest, "sha256": digest(rest)}
+
+
+def read_json(path: Path, schema: Any, sealed: bool = True) -> dict[str, Any]:
+    """The JSON object in a file of ours, without its `schema_version` and hash.
+
+    Args:
+        path: the file.
+        schema: what its values must be, of `data.schemas`, or another type of msgspec's.
+        sealed: whether it has a hash.
 
     Raises:
         MissingFile: no such file.
-        BrokenFile: not a JSON object, or a schema this version doesn't know.
+        BrokenFile: too large, not a JSON object, of a schema this version doesn't know, changed
+            since it was written, or a value is missing or of another type.
     """
     path = _existing(path)
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise BrokenFile(
-            f"{path}: not readable as JSON ({error}); fix it or make it again"
-        ) from error
-    except OSError as error:
-        raise BrokenFile(f"{path}: {error.strerror}; check the path and its permissions") from error
+    value = parse_json(_content(path, MAX_JSON_BYTES), str(path))
     if not isinstance(value, dict):
         raise BrokenFile(f"{path}: expected a JSON object, got {type(value).__name__}")
-    check_schema(path, value.pop("schema_version", None))
+    check_schema(path, value.get("schema_version"))
+    if sealed and value.get("sha256") != with_seal(value)["sha256"]:
+        raise BrokenFile(f"{path}: content differs from its hash; restore a copy or make it again")
+    del value["schema_version"]
+    if sealed:
+        del value["sha256"]
+    check_values(value, schema, str(path))
     return value
+
+
+def check_values(value: Any, schema: Any, what: str) -> Any:
+    """JSON values as the type that they must be.
+
+    Raises:
+        BrokenFile: a value is missing or of another type; the message says where.
+    """
+    try:
+        return msgspec.convert(value, schema)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise BrokenFile(
+            f"{what}: a field is missing or wrong ({error}); restore a copy or make it again"
+        ) from error
+
+
+def parse_json(content: bytes, what: str) -> Any:
+    """The value in strict JSON: no name twice, finite numbers, whole ones of 64 bits, real text.
+
+    Raises:
+        BrokenFile: it is something else; the message begins with `what`.
+    """
+    try:
+        value = msgspec.json.decode(content)
+        json.loads(content, object_pairs_hook=_once_each, parse_int=_whole)
+    except (ValueError, RecursionError, msgspec.MsgspecError) as error:
+        raise BrokenFile(
+            f"{what}: not readable as JSON ({error}); fix it or make it again"
+        ) from error
+    return value
+
+
+def _once_each(pairs: list[tuple[str, Any]]) -> None:
+    names = [name for name, _ in pairs]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice[:40]!r} stands there twice")
+
+
+def _whole(digits: str) -> None:
+    # Ten times within 64 bits with a sign.
+    if len(digits) > 18:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+
+
+def _content(path: Path, limit: int) -> bytes:
+    """All of a file that is no larger than the limit."""
+    try:
+        n = path.stat().st_size
+        if n > limit:
+            raise BrokenFile(
+                f"{path}: has {n / 2**20:.0f} MiB, at most {limit / 2**20:.0f} are read; "
+                "check that it is the file you mean"
+            )
+        return path.read_bytes()
+    except SartError:
+        raise
+    except OSError as error:
+        raise BrokenFile(f"{path}: {error.strerror}; check the path and its permissions") from error
+
+
+# A line ends with the beginning of the SHA-256 of all before.
+_LINE_SEAL = re.compile(rb'(?:, )?"check": "([0-9a-f]{16})"\}\Z')
+
+
+def _to_line(row: Mapping[str, Any]) -> bytes:
+    text = json.dumps(row, allow_nan=False).encode()
+    check = hashlib.sha256(text).hexdigest()[:16]
+    return text[:-1] + (b", " if row else b"") + f'"check": "{check}"}}\n'.encode()
+
+
+def _of_line(line: bytes) -> dict[str, Any] | None:
+    """The row that `_to_line` made a line of; None if it is no such line."""
+    seal = _LINE_SEAL.search(line)
+    if seal is None:
+        return None
+    text = line[: seal.start()] + b"}"
+    if hashlib.sha256(text).hexdigest()[:16].encode() != seal[1]:
+        return None
+    try:
+        row = msgspec.json.decode(text)
+    except (ValueError, RecursionError, msgspec.MsgspecError):
+        return None
+    return row if isinstance(row, dict) else None
 
 
 def append_json_line(path: Path, value: Mapping[str, Any]) -> None:
@@ -162,18 +277,42 @@ def append_json_line(path: Path, value: Mapping[str, Any]) -> None:
     Raises:
         CannotWrite: the disk refuses.
     """
-    with _cannot_write(Path(path)), open(path, "a", encoding="utf-8") as file:
-        file.write(json.dumps(value) + "\n")
+    with _cannot_write(Path(path)), open(path, "ab+") as file:
+        _drop_cut_line(file)
+        file.write(_to_line(value))
+
+
+def _drop_cut_line(file: io.BufferedRandom) -> None:
+    """Cut off what a crash left of a last line."""
+    end = file.seek(0, os.SEEK_END)
+    file.seek(max(0, end - 1))
+    if end and file.read() != b"\n":
+        file.seek(0)
+        file.truncate(file.read().rfind(b"\n") + 1)
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The JSON objects in a file of lines; none if it isn't there, a line that was cut left out."""
+    """The JSON objects in a file of lines; none if it isn't there, a last line cut short left out.
+
+    Raises:
+        BrokenFile: a line was changed since it was written, or the file is too large.
+    """
+    path = Path(path)
+    if not path.exists():
+        return []
+    lines = _content(_existing(path), MAX_LINES_BYTES).split(b"\n")[:-1]
     rows = []
-    if Path(path).exists():
-        for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
-            with contextlib.suppress(ValueError):
-                rows.append(json.loads(line))
-    return [row for row in rows if isinstance(row, dict)]
+    for i, line in enumerate(lines, 1):
+        row = _of_line(line)
+        if row is None:
+            if i == 1 and (found := re.match(rb'\{"schema_version": ?(\d{1,9})\b', line)):
+                check_schema(path, int(found[1]))
+            raise BrokenFile(
+                f"{path}: line {i} differs from its hash; restore a copy, or remove the file and "
+                "make it again"
+            )
+        rows.append(row)
+    return rows
 
 
 class OutputLock:
@@ -283,16 +422,18 @@ class Journal:
         rows: what it holds.
     """
 
-    def __init__(self, path: Path, lock: OutputLock | None = None) -> None:
+    def __init__(self, path: Path, lock: OutputLock | None = None, read: bool = True) -> None:
         """Open a journal, made if needed.
 
         Args:
             path: the file.
             lock: of the output that it is a journal of, released when the journal is closed; the
                 file's own if left out.
+            read: whether its rows matter; not where they are dropped next.
 
         Raises:
             CannotWrite: the disk refuses, or another process has it open.
+            BrokenFile: a row was changed since it was written.
         """
         self.path = Path(path)
         self._lock = lock or OutputLock(path)
@@ -300,11 +441,8 @@ class Journal:
             with _cannot_write(self.path):
                 linked(path).parent.mkdir(parents=True, exist_ok=True)
                 self._file = open(self.path, "ab+")  # noqa: SIM115 - open until `close`
-                self._file.seek(0)
-                content = self._file.read()
-                if not content.endswith(b"\n"):
-                    self._file.truncate(content.rfind(b"\n") + 1)
-            self.rows = read_json_lines(self.path)
+                _drop_cut_line(self._file)
+            self.rows = read_json_lines(self.path) if read else []
         except BaseException:
             self._lock.close()
             raise
@@ -317,7 +455,7 @@ class Journal:
             InvalidInput: a number is NaN or infinite, or a value isn't JSON.
         """
         try:
-            line = json.dumps(row, allow_nan=False).encode() + b"\n"
+            line = _to_line(row)
         except (TypeError, ValueError) as error:
             raise InvalidInput(f"{self.path}: can't be written as JSON: {error}") from error
         with _cannot_write(self.path):
@@ -451,13 +589,15 @@ def remove_temporary_files(directory: Path) -> None:
 def _existing(path: Path) -> Path:
     path = Path(path)
     try:
-        present = path.exists()
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError, ValueError) as error:
+        raise MissingFile(f"{path}: no such file; check the path, or make it first") from error
     except OSError as error:
         raise BrokenFile(f"{path}: {error.strerror}; check the path") from error
-    if not present:
-        raise MissingFile(f"{path}: no such file; check the path, or make it first")
-    if path.is_dir():
+    if stat.S_ISDIR(mode):
         raise BrokenFile(f"{path}: is a directory; expected a file")
+    if not stat.S_ISREG(mode):
+        raise BrokenFile(f"{path}: is no regular file; pass another")
     return path
 
 
@@ -477,16 +617,74 @@ def check_schema(path: Path, version: Any) -> None:
 # --- HDF5 ---------------------------------------------------------------------------------------
 
 
+# An HDF5 file may begin with a block of its user's. Ours says what the file is, and the SHA-256 of
+# all that follows, so that HDF5's library reads no byte that we did not write.
+_BLOCK = 512
+_MAGIC = b"sart_toolkit "
+# What was compared with its hash and inspected, by this process, or written by it.
+_inspected: set[str] = set()
+
+
+def _header(kind: str, n_bytes: int, sha256: str) -> bytes:
+    about = {"kind": kind, "schema_version": SCHEMA_VERSION, "bytes": n_bytes, "sha256": sha256}
+    return (_MAGIC + json.dumps(about).encode() + b"\n").ljust(_BLOCK, b"\0")
+
+
+def _header_of(path: Path, block: bytes) -> dict[str, Any]:
+    """What the first block of a file says.
+
+    Raises:
+        BrokenFile: it is no file of ours, or of a schema this version doesn't know.
+    """
+    if block.startswith(b"\x89HDF"):
+        raise BrokenFile(
+            f"{path}: schema_version is older than {SCHEMA_VERSION}, or the file is not of "
+            "sart_toolkit; record or generate it again, or use the toolkit version that wrote it"
+        )
+    try:
+        about = msgspec.json.decode(block.removeprefix(_MAGIC).split(b"\n")[0])
+        known = block.startswith(_MAGIC) and isinstance(about, dict)
+    except (ValueError, RecursionError, msgspec.MsgspecError):
+        known = False
+    if not known:
+        raise BrokenFile(
+            f"{path}: truncated or not a file of sart_toolkit; restore a copy or make it again"
+        )
+    check_schema(path, about.get("schema_version"))
+    return dict(about)
+
+
+def _check_bytes(path: Path, kind: str) -> str:
+    """The SHA-256 of a file of `kind`, which is what its first block says.
+
+    Raises:
+        BrokenFile: it isn't; the file was changed since it was written.
+    """
+    with open(path, "rb") as file:
+        block = file.read(_BLOCK)
+        about = _header_of(path, block)
+        if about.get("kind") != kind:
+            raise BrokenFile(
+                f"{path}: holds {about.get('kind')!r}, expected a {kind}; pass another file"
+            )
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        n_bytes = file.tell() - _BLOCK
+    if block != _header(kind, n_bytes, sha256):
+        cut = n_bytes != about.get("bytes")
+        what = f"truncated or not a {kind} file" if cut else "content differs from its hash"
+        raise BrokenFile(f"{path}: {what}; restore a copy or make it again")
+    return sha256
+
+
 @contextlib.contextmanager
 def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
     path = _existing(path)
     try:
+        sha256 = _check_bytes(path, kind)
+        if sha256 not in _inspected:
+            inspect(path, kind)
+            _inspected.add(sha256)
         with h5py.File(path, "r") as file:
-            found = file.attrs.get("kind")
-            if found != kind:
-                raise BrokenFile(f"{path}: holds {found!r}, expected a {kind}; pass another file")
-            version = file.attrs.get("schema_version")
-            check_schema(path, version.item() if isinstance(version, np.generic) else version)
             yield file
     except InvalidInput as error:
         raise BrokenFile(f"{path}: {error}; restore a copy or make it again") from error
@@ -494,7 +692,8 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
         raise
     # A damaged file may hold anything in place of a group, a number or JSON.
     except (
-        OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, lzma.LZMAError
+        OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError,
+        OverflowError, lzma.LZMAError
     ) as error:  # fmt: skip
         raise BrokenFile(
             f"{path}: truncated or not a {kind} file ({error}); restore a copy or make it again"
@@ -502,15 +701,22 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
 
 
 @contextlib.contextmanager
-def _writing(path: Path, kind: str) -> Iterator[h5py.File]:
+def _writing(path: Path, kind: str, meta: Mapping[str, Any]) -> Iterator[h5py.File]:
+    try:
+        text = json.dumps(meta, allow_nan=False, default=dataclasses.asdict).encode()
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"{path}: can't be written as JSON: {error}") from error
     # In memory first: HDF5 crashes the process when a disk fills up under an open file.
     content = io.BytesIO()
-    with h5py.File(content, "w") as file:
-        file.attrs["kind"] = kind
-        file.attrs["schema_version"] = SCHEMA_VERSION
+    with h5py.File(content, "w", userblock_size=_BLOCK) as file:
+        file["meta"] = np.frombuffer(text, dtype=np.uint8)
         yield file
-    with replacing(path) as temporary:
-        temporary.write_bytes(content.getbuffer())
+    with content.getbuffer() as all_:
+        sha256 = hashlib.sha256(all_[_BLOCK:]).hexdigest()
+        all_[:_BLOCK] = _header(kind, len(all_) - _BLOCK, sha256)
+        with replacing(path) as temporary:
+            temporary.write_bytes(all_)
+    _inspected.add(sha256)
 
 
 _STEP_ARRAYS = [f.name for f in dataclasses.fields(Steps) if f.name != "cameras"]
@@ -519,8 +725,9 @@ _STEP_ARRAYS = [f.name for f in dataclasses.fields(Steps) if f.name != "cameras"
 def _put_steps(group: h5py.Group, steps: Steps) -> None:
     for name in _STEP_ARRAYS:
         group[name] = getattr(steps, name)
+    cameras = group.create_group("cameras")
     for name, camera in steps.cameras.items():
-        at = group.create_group(f"cameras/{name}")
+        at = cameras.create_group(name)
         # One chunk an image, LZF: a tenth of gzip's time, and a step can be read by itself.
         for part, frames in (("rgb", camera.rgb), ("depth", camera.depth)):
             at.create_dataset(
@@ -528,21 +735,55 @@ def _put_steps(group: h5py.Group, steps: Steps) -> None:
             )
         at["intrinsics"] = camera.intrinsics
         at["T_frame_camera"] = camera.T_frame_camera
-        at.attrs["frame"] = camera.frame
 
 
-def _get_steps(group: h5py.Group) -> Steps:
+def _get_steps(group: h5py.Group, frames: Mapping[str, CameraFrame]) -> Steps:
     cameras = {
-        name: CameraRecord(
-            rgb=at["rgb"][()],
-            depth=at["depth"][()],
-            intrinsics=at["intrinsics"][()],
-            frame=at.attrs["frame"],
-            T_frame_camera=at["T_frame_camera"][()],
-        )
-        for name, at in group.get("cameras", {}).items()
+        name: CameraRecord(frame=frame, **{k: v[()] for k, v in group["cameras"][name].items()})
+        for name, frame in sorted(frames.items())
     }
+    if cameras.keys() != group["cameras"].keys():
+        raise InvalidInput(f"cameras: expected {list(cameras)}, got {list(group['cameras'])}")
     return Steps(cameras=cameras, **{name: group[name][()] for name in _STEP_ARRAYS})
+
+
+def _frames(steps: Steps) -> dict[str, str]:
+    """What each camera is mounted on."""
+    return {name: camera.frame for name, camera in steps.cameras.items()}
+
+
+def _schema_of(record: type, without: Sequence[str] = (), **other: Any) -> type[msgspec.Struct]:
+    """The types of a record's fields, those `without` left out and `other` in place or besides."""
+    hints = typing.get_type_hints(record)
+    names = [f.name for f in dataclasses.fields(record) if f.name not in without]
+    fields = {**{name: hints[name] for name in names}, **other}
+    return msgspec.defstruct(f"{record.__name__}Meta", fields.items(), forbid_unknown_fields=True)
+
+
+_DEMONSTRATION_ARRAYS = (
+    "steps", "timestamps", "body_Ts_world", "success", "raw_commands", "states"
+)  # fmt: skip
+_DemonstrationMeta = _schema_of(
+    Demonstration,
+    _DEMONSTRATION_ARRAYS,
+    references=References,
+    cameras=dict[str, CameraFrame],
+    content_hash=str,
+)
+_ProvenanceMeta = _schema_of(Provenance, T_world_sampled=Matrix)
+_EpisodeMeta = _schema_of(
+    Episode,
+    ("steps", "joint_path"),
+    provenance=_ProvenanceMeta,
+    cameras=dict[str, CameraFrame],
+    content_hash=str,
+)
+
+
+def _meta(file: h5py.File, path: Path, schema: type[msgspec.Struct]) -> dict[str, Any]:
+    """What a file says besides its arrays."""
+    value = parse_json(file["meta"][()].tobytes(), str(path))
+    return msgspec.structs.asdict(check_values(value, schema, str(path)))
 
 
 def save_demonstration(path: Path, demonstration: Demonstration) -> None:
@@ -550,38 +791,58 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
 
     Raises:
         CannotWrite: the disk refuses.
+        InvalidInput: a parameter of its task is no JSON value.
     """
     d = demonstration
-    with _writing(path, "demonstration") as file:
+    meta = {
+        f.name: getattr(d, f.name)
+        for f in dataclasses.fields(d)
+        if f.name not in _DEMONSTRATION_ARRAYS
+    } | {"cameras": _frames(d.steps), "content_hash": d.content_hash()}
+    with _writing(path, "demonstration", meta) as file:
         _put_steps(file.create_group("steps"), d.steps)
         file["timestamps"] = d.timestamps
         file["raw_commands"] = d.raw_commands
-        file["success"] = d.success
-        file["touching"] = json.dumps(d.touching)
+        file["success"] = d.success.astype(np.uint8)
+        bodies = file.create_group("body_Ts_world")
         for name, Ts in d.body_Ts_world.items():
-            file[f"body_Ts_world/{name}"] = Ts
-        sizes = np.array([len(state) for state in d.states], dtype=np.int64)
-        file["states/sizes"] = sizes
+            bodies[name] = Ts
+        file["states/sizes"] = np.array([len(state) for state in d.states], dtype="<i8")
         # States are nearly alike, and farther apart than the windows of HDF5's filters reach.
         packed = lzma.compress(b"".join(d.states), preset=0)
         file["states/xz"] = np.frombuffer(packed, dtype=np.uint8)
-        file.attrs["meta"] = json.dumps(
-            {
-                "task": d.task,
-                "task_parameters": dict(d.task_parameters),
-                "robot": d.robot,
-                "backend": d.backend,
-                "operator": d.operator,
-                "device": d.device,
-                "seconds": d.seconds,
-                "seed": d.seed,
-                "versions": dict(d.versions),
-                "rates": dataclasses.asdict(d.rates),
-                "judged_by": d.judged_by,
-                "references": dict(d.references),
-                "content_hash": d.content_hash(),
-            }
+
+
+# States may be so much larger than they are packed, and a few always so large.
+_STATES_RATIO = 1000
+_STATES_BYTES = 256 * 2**20
+
+
+def _unpacked_states(sizes: Sequence[int], packed: bytes) -> tuple[bytes, ...]:
+    """States of given sizes, out of one xz stream.
+
+    Raises:
+        ValueError: they are others, or larger than any demonstration's.
+    """
+    total = sum(sizes)
+    if min(sizes, default=0) < 0 or total > max(_STATES_BYTES, _STATES_RATIO * len(packed)):
+        raise ValueError(
+            f"states: {total} bytes packed into {len(packed)}; record fewer steps at once"
         )
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=64 * 2**20)
+    states = []
+    for size in sizes:
+        state = b""
+        while len(state) < size:
+            if unpacker.eof or (unpacker.needs_input and not packed):
+                raise ValueError("states: end before their sizes say so")
+            state += unpacker.decompress(packed, max_length=size - len(state))
+            packed = b""
+        states.append(state)
+    # What is left is the stream's own end.
+    if not unpacker.eof and unpacker.decompress(packed, max_length=1):
+        raise ValueError("states: go on after their sizes say so")
+    return tuple(states)
 
 
 def load_demonstration(path: Path) -> Demonstration:
@@ -591,21 +852,19 @@ def load_demonstration(path: Path) -> Demonstration:
         MissingFile: no such file.
         BrokenFile: truncated, another kind of file, or its content no longer matches its hash.
     """
+    path = Path(path)
     with _reading(path, "demonstration") as file:
-        meta = json.loads(file.attrs["meta"])
-        expected = meta.pop("content_hash")
-        packed = lzma.decompress(file["states/xz"][()].tobytes())
-        ends = np.cumsum(file["states/sizes"][()])
-        starts = ends - file["states/sizes"][()]
+        meta = _meta(file, path, _DemonstrationMeta)
+        expected, frames = meta.pop("content_hash"), meta.pop("cameras")
         demonstration = Demonstration(
-            steps=_get_steps(file["steps"]),
+            steps=_get_steps(file["steps"], frames),
             timestamps=file["timestamps"][()],
             raw_commands=file["raw_commands"][()],
-            success=file["success"][()],
-            touching=json.loads(file["touching"][()]),
-            body_Ts_world={k: v[()] for k, v in file.get("body_Ts_world", {}).items()},
-            states=tuple(packed[a:b] for a, b in zip(starts, ends, strict=True)),
-            rates=Rates(**meta.pop("rates")),
+            success=file["success"][()].astype(bool),
+            body_Ts_world={k: v[()] for k, v in file["body_Ts_world"].items()},
+            states=_unpacked_states(
+                file["states/sizes"][()].tolist(), file["states/xz"][()].tobytes()
+            ),
             **meta,
         )
         if demonstration.content_hash() != expected:
@@ -620,15 +879,19 @@ def save_episode(path: Path, episode: Episode) -> str:
 
     Raises:
         CannotWrite: the disk refuses.
+        InvalidInput: its certificate is no JSON value.
     """
     provenance = dataclasses.asdict(episode.provenance)
     provenance["T_world_sampled"] = episode.provenance.T_world_sampled.tolist()
     content_hash = episode.content_hash()
-    with _writing(path, "episode") as file:
+    meta = {
+        "provenance": provenance,
+        "cameras": _frames(episode.steps),
+        "content_hash": content_hash,
+    }
+    with _writing(path, "episode", meta) as file:
         _put_steps(file.create_group("steps"), episode.steps)
         file["joint_path"] = episode.joint_path
-        file.attrs["provenance"] = json.dumps(provenance)
-        file.attrs["content_hash"] = content_hash
     return content_hash
 
 
@@ -643,11 +906,16 @@ def load_episode(path: Path, content_hash: str | None = None) -> Episode:
         MissingFile: no such file.
         BrokenFile: truncated, another kind of file, or its content doesn't match its hash.
     """
+    path = Path(path)
     with _reading(path, "episode") as file:
-        provenance = Provenance(**json.loads(file.attrs["provenance"]))
-        episode = Episode(_get_steps(file["steps"]), provenance, file["joint_path"][()])
+        meta = _meta(file, path, _EpisodeMeta)
+        episode = Episode(
+            _get_steps(file["steps"], meta["cameras"]),
+            Provenance(**msgspec.structs.asdict(meta["provenance"])),
+            file["joint_path"][()],
+        )
         found = episode.content_hash()
-        if found != file.attrs["content_hash"] or content_hash not in (None, found):
+        if found != meta["content_hash"] or content_hash not in (None, found):
             raise BrokenFile(f"{path}: content differs from its hash; generate it again")
         return episode
 
@@ -659,12 +927,10 @@ def load_recording(path: Path) -> Demonstration | Episode:
         MissingFile: no such file.
         BrokenFile: truncated or another kind of file.
     """
-    try:
-        return load_demonstration(path)
-    except BrokenFile as error:
-        if "holds 'episode'" not in str(error):
-            raise
-    return load_episode(path)
+    with open(_existing(path), "rb") as file:
+        block = file.read(_BLOCK)
+    episode = _header_of(Path(path), block).get("kind") == "episode"
+    return load_episode(path) if episode else load_demonstration(path)
 
 
 # --- annotations ---------------------------------------------------------------------------------
@@ -702,45 +968,28 @@ def annotation_from_json(value: Mapping[str, Any], path: Path) -> Annotation:
     """The annotation in JSON values read from `path`.
 
     Raises:
-        BrokenFile: a field is missing or unknown.
-        InvalidInput: a value is out of range, such as a radius <= 0 or NaN.
+        BrokenFile: a field is missing, unknown or of another type.
+        InvalidInput: a value is out of range, such as a radius <= 0.
     """
+    found: AnnotationFile = check_values(value, AnnotationFile, f"{path}: not an annotation")
     try:
-        unknown = set(value) - {
-            "about", "demonstration_hash", "seconds_spent", "settings", "spheres"
-        }  # fmt: skip
-        if unknown:
-            raise BrokenFile(f"{path}: unknown field {sorted(unknown)[0]!r}; remove it")
-        spheres = []
-        for row in value["spheres"]:
-            unknown = set(row) - {
-                "waypoint", "radius_m", "kind", "source", "clearance_m", "limited_by", "T_world_key"
-            }  # fmt: skip
-            if unknown:
-                raise BrokenFile(f"{path}: unknown sphere field {sorted(unknown)[0]!r}; remove it")
-            spheres.append(
-                PrecisionSphere(
-                    waypoint=row["waypoint"],
-                    T_world_key=row["T_world_key"],
-                    radius=row["radius_m"],
-                    kind=row.get("kind", "ball"),
-                    source=row.get("source", "human"),
-                    clearance=row.get("clearance_m"),
-                    limited_by=row.get("limited_by"),
-                )
+        spheres = [
+            PrecisionSphere(
+                waypoint=sphere.waypoint,  # type: ignore[arg-type] # checked there to be whole
+                T_world_key=sphere.T_world_key,  # type: ignore[arg-type] # becomes an array there
+                radius=sphere.radius_m,
+                kind=sphere.kind,
+                source=sphere.source,
+                clearance=sphere.clearance_m,
+                limited_by=sphere.limited_by,
             )
+            for sphere in found.spheres
+        ]
         return Annotation(
-            tuple(spheres),
-            value["demonstration_hash"],
-            float(value.get("seconds_spent", 0.0)),
-            value.get("settings", {}),
+            tuple(spheres), found.demonstration_hash, found.seconds_spent, found.settings
         )
-    except SartError as error:
-        if isinstance(error, InvalidInput):
-            raise InvalidInput(f"{path}: {error}") from error
-        raise
-    except (KeyError, TypeError, ValueError) as error:
-        raise BrokenFile(f"{path}: not an annotation, {error!r} is missing or wrong") from error
+    except InvalidInput as error:
+        raise InvalidInput(f"{path}: {error}") from error
 
 
 def save_annotation(path: Path, annotation: Annotation) -> None:
@@ -749,7 +998,7 @@ def save_annotation(path: Path, annotation: Annotation) -> None:
     Raises:
         CannotWrite: the disk refuses.
     """
-    write_json(path, annotation_to_json(annotation))
+    write_json(path, annotation_to_json(annotation), sealed=False)
 
 
 def load_annotation(path: Path) -> Annotation:
@@ -757,7 +1006,7 @@ def load_annotation(path: Path) -> Annotation:
 
     Raises:
         MissingFile: no such file.
-        BrokenFile: not JSON, or a field is missing or unknown.
+        BrokenFile: not JSON, or a field is missing, unknown or of another type.
         InvalidInput: a value is out of range.
     """
-    return annotation_from_json(read_json(path), Path(path))
+    return annotation_from_json(read_json(path, dict, sealed=False), Path(path))

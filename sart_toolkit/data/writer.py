@@ -21,6 +21,7 @@ from sart_toolkit.data.manifest import (
     EpisodeEntry,
     Manifest,
     Rejection,
+    entry_of,
     episode_name,
     kept_row,
     rejected_row,
@@ -75,18 +76,16 @@ class EpisodeFiles:
             CannotWrite: the disk refuses.
         """
         p = episode.provenance
-        clearance = p.certificate["commanded"]["clearance"] if p.certificate else None
         key = AttemptKey(p.source, p.sphere, p.k)
-        content_hash = save_episode(self._path / episode_name(key), episode)
-        return EpisodeEntry(*key, len(episode), content_hash, clearance)
+        return entry_of(episode, save_episode(self._path / episode_name(key), episode))
 
     def hold(self, entry: EpisodeEntry) -> bool:
-        """Whether an episode's file is there and whole."""
+        """Whether an episode's file is there and whole, and what the entry says."""
         try:
-            load_episode(self._path / entry.name, entry.content_hash)
+            episode = load_episode(self._path / entry.name, entry.content_hash)
+            return entry_of(episode, entry.content_hash) == entry
         except SartError:
             return False
-        return True
 
 
 class DatasetWriter:
@@ -137,7 +136,7 @@ class DatasetWriter:
         except BaseException:
             lock.close()
             raise
-        self._journal = Journal(path / MANIFEST, lock)
+        self._journal = Journal(path / MANIFEST, lock, read=not overwrite)
         try:
             self._manifest = self._opened(wanted, overwrite)
             self.files = EpisodeFiles(path)
@@ -277,6 +276,7 @@ class DatasetWriter:
             ],
             "least_commanded_clearance_m": min(clearances, default=None),
             "content_hash": manifest.content_hash(),
+            "manifest_hash": manifest.whole_hash(),
             "versions": library_versions(),
         }
         write_json(self.path / SUMMARY, summary)

@@ -22,10 +22,11 @@ from sart_toolkit.data.records import (
     Referring,
     library_versions,
 )
-from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, SartError
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, SartError
 from sart_toolkit.learn.frames import input_size, resize_area
 from sart_toolkit.learn.policy import Policy
 from sart_toolkit.learn.samples import remove_windows
+from sart_toolkit.learn.skillfiles import check_directory, load_files, write_config
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.training import (
     CHECKPOINT,
@@ -284,15 +285,24 @@ def save_skill(
 
     Raises:
         OutputExists: there is a skill already and `overwrite` is false.
+        InvalidInput: a weight is NaN or infinite.
         CannotWrite: another process is at work on the directory, or the disk refuses.
     """
     path = Path(path)
+    weights = result.policy.state_dict()
+    if (name := _not_finite(weights)) is not None:
+        raise InvalidInput(
+            f"policy: weight {name!r} has NaN or infinite values, so it can't be saved; train "
+            "again with another --seed or a lower learning rate"
+        )
     with storage.OutputLock(path, nested=True):
         storage.check_writable(path / "config.json", overwrite)
-        return _write_skill(path, result, dataset)
+        return _write_skill(path, result, dataset, weights)
 
 
-def _write_skill(path: Path, result: TrainResult, dataset: Dataset) -> SkillConfig:
+def _write_skill(
+    path: Path, result: TrainResult, dataset: Dataset, weights: Mapping[str, torch.Tensor]
+) -> SkillConfig:
     storage.remove(path / "config.json")
     source = dataset.sources[0]
     demonstration = source.demonstration
@@ -317,27 +327,23 @@ def _write_skill(path: Path, result: TrainResult, dataset: Dataset) -> SkillConf
     )
     storage.save_demonstration(path / "demo.h5", demonstration)
     storage.save_annotation(path / "annotation.json", source.annotation)
-    storage.write_json(
-        path / "training.json",
-        {
-            "curve": [dataclasses.asdict(record) for record in result.curve],
-            "final_loss": result.final_loss,
-            "seconds": result.seconds,
-            "images_per_second": result.images_per_second,
-            "windows": result.n_windows,
-            "trajectories": result.n_trajectories,
-            "device": result.device,
-            "bfloat16": result.bfloat16,
-            "config": result.config.to_json(),
-            "versions": library_versions(),
-        },
-    )
+    training = {
+        "curve": [dataclasses.asdict(record) for record in result.curve],
+        "final_loss": result.final_loss,
+        "seconds": result.seconds,
+        "images_per_second": result.images_per_second,
+        "windows": result.n_windows,
+        "trajectories": result.n_trajectories,
+        "device": result.device,
+        "bfloat16": result.bfloat16,
+        "config": result.config.to_json(),
+        "versions": library_versions(),
+    }
+    storage.write_json(path / "training.json", training)
     save_tensors(
-        path / "model.safetensors",
-        result.policy.state_dict(),
-        {"demonstration_hash": config.demonstration_hash},
+        path / "model.safetensors", weights, {"demonstration_hash": config.demonstration_hash}
     )
-    storage.write_json(path / "config.json", config.to_json())
+    write_config(path, config.to_json())
     storage.remove(path / CHECKPOINT)
     remove_windows(path)
     return config
@@ -352,39 +358,37 @@ def load_skill(path: Path, device: str = "cpu") -> Skill:
 
     Raises:
         MissingFile: no such directory, or it lacks a file.
-        BrokenFile: a file is truncated or not what it should be.
+        BrokenFile: a file is truncated, was changed, or holds a weight that is no finite number.
         Mismatch: its files belong to different skills.
         InvalidInput: CUDA was asked for and isn't there.
     """
     path = Path(path)
-    if not path.is_dir():
-        raise MissingFile(f"{path}: no such skill directory; make it with `sart train`")
+    check_directory(path)
+    # What is damaged, before what belongs to something else.
+    tensors, _ = load_tensors(path / "model.safetensors")
+    files = load_files(path)
     try:
-        config = SkillConfig.from_json(storage.read_json(path / "config.json"))
-    except (MissingFile, BrokenFile):
-        raise
-    except (SartError, TypeError) as error:
+        config = SkillConfig.from_json(files.config)
+    except (SartError, TypeError, ValueError, LookupError, OverflowError) as error:
         raise BrokenFile(f"{path / 'config.json'}: {error}") from error
-    training = storage.read_json(path / "training.json")
-    demonstration = storage.load_demonstration(path / "demo.h5")
-    annotation = storage.load_annotation(path / "annotation.json")
-    tensors, about = load_tensors(path / "model.safetensors")
-    for name, found in (
-        ("demo.h5", demonstration.content_hash()),
-        ("annotation.json", annotation.demonstration_hash),
-        ("model.safetensors", about.get("demonstration_hash")),
-    ):
-        if found != config.demonstration_hash:
-            raise Mismatch(
-                f"{path / name}: belongs to another demonstration than config.json; copy the "
-                "whole skill directory again"
-            )
+    if (name := _not_finite(tensors)) is not None:
+        raise BrokenFile(
+            f"{path / 'model.safetensors'}: weight {name!r} has NaN or infinite values; train again"
+        )
     policy = build_policy(config.training, config.image_sizes)
     try:
         policy.load_state_dict(tensors)
-    except RuntimeError as error:
+    except (RuntimeError, TypeError, ValueError) as error:
         raise Mismatch(
             f"{path / 'model.safetensors'}: does not fit the policy in config.json "
             f"({str(error).splitlines()[-1].strip()}); copy the whole skill directory again"
         ) from error
-    return Skill(policy, config, demonstration, annotation, training, device)
+    return Skill(policy, config, files.demonstration, files.annotation, files.training, device)
+
+
+def _not_finite(tensors: Mapping[str, torch.Tensor]) -> str | None:
+    """The name of the first tensor that holds NaN or an infinite value."""
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            return name
+    return None

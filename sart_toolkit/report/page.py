@@ -18,6 +18,7 @@ import jinja2
 
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.data.schemas import EvaluationFile, RunFile, TrainingFile
 from sart_toolkit.data.storage import (
     load_annotation,
     load_demonstration,
@@ -121,9 +122,9 @@ def _load_run(directory: Path) -> _Run:
         augmentation=dataset.info if dataset is not None else None,
         paths=paths,
         proofs=proofs,
-        training=optional("skill/training.json", read_json),
-        evaluation=optional("evaluation.json", read_json),
-        run=optional("run.json", read_json),
+        training=optional("skill/training.json", lambda path: read_json(path, TrainingFile)),
+        evaluation=optional("evaluation.json", lambda path: read_json(path, EvaluationFile)),
+        run=optional("run.json", lambda path: read_json(path, RunFile)),
     )
     parts = (run.demonstration, run.annotation, dataset, run.training, run.evaluation, run.run)
     if all(part is None for part in parts):

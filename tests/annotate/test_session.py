@@ -28,6 +28,7 @@ from sart_toolkit.data.sampling import sample_in_region, sample_pose
 from sart_toolkit.data.storage import (
     Journal,
     annotation_to_json,
+    append_json_line,
     load_annotation,
     save_annotation,
     save_demonstration,
@@ -496,8 +497,10 @@ def test_a_journal_of_something_else_is_refused(session, open_session, tmp_path)
         ([header, {**json.loads(row), "selected": 99}], BrokenFile, "not a journal"),
         ([header, {**json.loads(row), "spheres": [{"waypoint": 99}]}], BrokenFile, "not a journ"),
     ]:  # fmt: skip
-        text = [x if isinstance(x, str) else json.dumps(x) for x in lines]
-        path.write_text("\n".join(text) + "\n")
+        rows = [json.loads(x) if isinstance(x, str) else x for x in lines]
+        path.unlink()
+        for row in rows:
+            append_json_line(path, {k: v for k, v in row.items() if k != "check"})
         with pytest.raises(kind, match=message):
             open_session()
 

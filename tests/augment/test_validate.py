@@ -15,7 +15,13 @@ from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.manifest import Manifest
 from sart_toolkit.data.records import Steps
-from sart_toolkit.data.storage import load_episode, read_json_lines, save_episode
+from sart_toolkit.data.storage import (
+    append_json_line,
+    load_episode,
+    read_json_lines,
+    save_episode,
+    with_seal,
+)
 from sart_toolkit.errors import BrokenFile, Mismatch, MissingFile
 
 
@@ -38,6 +44,12 @@ def validate(peg_model, peg_task):
     return lambda path, **options: validate_dataset(path, peg_model.spec, peg_task.scene, **options)
 
 
+def rewrite(path, changes):
+    """Change top-level keys of a JSON file of ours and make its hash fit; None removes one."""
+    value = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps(with_seal({k: v for k, v in value.items() if v is not None})))
+
+
 def change(path, index=0, **changes):
     """Change an episode and write it with hashes that fit."""
     name = load_dataset(path).index[index].name
@@ -46,10 +58,13 @@ def change(path, index=0, **changes):
     save_episode(path / name, changed)
     manifest = path / "manifest.jsonl"
     old, new = episode.content_hash(), changed.content_hash()
-    manifest.write_text(manifest.read_text().replace(old, new))
-    info = json.loads((path / "dataset.json").read_text())
-    info["content_hash"] = Manifest.from_rows(manifest, read_json_lines(manifest)).content_hash()
-    (path / "dataset.json").write_text(json.dumps(info))
+    rows = read_json_lines(manifest)
+    manifest.unlink()
+    for row in rows:
+        append_json_line(manifest, row | ({"content_hash": new} if old in row.values() else {}))
+    found = Manifest.from_rows(manifest, read_json_lines(manifest))
+    hashes = {"content_hash": found.content_hash(), "manifest_hash": found.whole_hash()}
+    rewrite(path / "dataset.json", hashes)
     return name
 
 
@@ -192,9 +207,7 @@ def test_an_episode_with_a_step_too_few_is_reported(copy, validate):
 def test_what_is_no_dataset_is_refused(copy, validate, tmp_path):
     with pytest.raises(MissingFile, match="dataset.json: no such file"):
         validate(tmp_path)
-    info = json.loads((copy / "dataset.json").read_text())
-    del info["config"]
-    (copy / "dataset.json").write_text(json.dumps(info))
+    rewrite(copy / "dataset.json", {"config": None})
     with pytest.raises(BrokenFile, match="'config' is missing or wrong; generate again"):
         validate(copy)
 

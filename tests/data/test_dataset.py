@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 
 import pytest
@@ -11,7 +12,10 @@ from sart_toolkit.data import dataset as dataset_module
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import Annotation
 from sart_toolkit.data.storage import (
+    append_json_line,
     load_annotation,
+    read_json,
+    read_json_lines,
     save_annotation,
     save_demonstration,
     save_episode,
@@ -108,15 +112,44 @@ def test_a_dataset_without_its_manifest_is_reported(made):
         lambda text: text.replace('"annotation": "', '"annotation": "0', 1),
     ],
 )
-def test_a_manifest_that_was_changed_is_reported_by_the_hash(made, change):
+def test_a_manifest_that_was_changed_is_reported_by_a_hash(made, change):
     manifest = made[0] / "manifest.jsonl"
     manifest.write_text(change(manifest.read_text()))
+    with pytest.raises(BrokenFile, match="differs from its hash; "):
+        load_dataset(made[0])
+
+
+@pytest.mark.parametrize(
+    ("i", "change"),
+    [
+        (0, {"request": {"n": 100}}),
+        (2, {"steps": 5}),
+        (2, {"clearance_m": 0.5}),
+        (2, {"outcome": "joint jump"}),
+    ],
+)
+def test_a_manifest_row_that_was_written_otherwise_is_reported(made, i, change):
+    """Its line's hash fits, and what the dataset says of all lines doesn't."""
+    manifest = made[0] / "manifest.jsonl"
+    rows = read_json_lines(manifest)
+    manifest.unlink()
+    for k, row in enumerate(rows):
+        append_json_line(manifest, {**row, **change} if k == i else row)
     with pytest.raises(BrokenFile, match="content differs from its hash; generate it again"):
         load_dataset(made[0])
 
 
+@pytest.mark.parametrize("name", ["n_kept", "seconds", "task"])
+def test_a_changed_summary_is_reported_by_its_hash(made, name):
+    info = json.loads((made[0] / "dataset.json").read_text())
+    (made[0] / "dataset.json").write_text(json.dumps({**info, name: 3}))
+    with pytest.raises(BrokenFile, match="dataset.json: content differs from its hash"):
+        load_dataset(made[0])
+
+
 def test_a_dataset_s_hash_is_that_of_its_manifest(made):
-    write_json(made[0] / "dataset.json", {"content_hash": "x"})
+    info = read_json(made[0] / "dataset.json", dict)
+    write_json(made[0] / "dataset.json", {**info, "content_hash": "x"})
     with pytest.raises(BrokenFile, match="content differs from its hash"):
         load_dataset(made[0])
 

@@ -460,12 +460,23 @@ def test_a_demonstrations_hash_follows_every_array_that_was_shown():
     assert len(hashes) == 1 + len(names) + 4 + 8
 
 
-def test_a_demonstrations_hash_leaves_out_clock_time_and_saved_states():
+def test_a_demonstrations_hash_leaves_out_who_made_it_when_and_where_its_parts_are():
     demonstration = make_demonstration()
     other = dataclasses.replace(
-        demonstration, states=(), seconds=9.0, versions={"numpy": "0"}, operator="someone else"
+        demonstration,
+        seconds=9.0,
+        versions={"numpy": "0"},
+        operator="someone else",
+        references={"task": "my_task.py:TASK"},
     )
     assert other.content_hash() == demonstration.content_hash()
+
+
+def test_a_demonstrations_hash_follows_its_states_its_backend_and_its_judge():
+    demonstration = make_demonstration()
+    changes = [{"states": ()}, {"backend": "another"}, {"judged_by": "nobody"}]
+    hashes = {dataclasses.replace(demonstration, **change).content_hash() for change in changes}
+    assert len(hashes | {demonstration.content_hash()}) == 4
 
 
 def test_an_episodes_hash_follows_its_steps_and_its_provenance():

@@ -14,7 +14,7 @@ import pytest
 from sart_toolkit.data import writer as writer_module
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.manifest import AttemptKey, Rejection
-from sart_toolkit.data.storage import read_json_lines
+from sart_toolkit.data.storage import append_json_line, read_json_lines
 from sart_toolkit.data.writer import DatasetWriter
 from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, Mismatch, OutputExists
 
@@ -131,6 +131,19 @@ def test_a_row_that_was_cut_short_does_not_count(carry_out, tmp_path):
     manifest.write_text(manifest.read_text()[:-20])
     assert carry_out(tmp_path / "d").content_hash == whole.content_hash
     assert len(read_json_lines(manifest)) == 1 + whole.info["n_attempted"]
+
+
+@pytest.mark.parametrize("change", [{"steps": 9}, {"clearance_m": 0.5}, {"content_hash": "0"}])
+def test_a_row_that_says_otherwise_than_its_episode_does_not_count(carry_out, tmp_path, change):
+    whole = carry_out(tmp_path / "whole")
+    carry_out(tmp_path / "d", 5)
+    manifest = tmp_path / "d" / "manifest.jsonl"
+    rows = read_json_lines(manifest)
+    manifest.unlink()
+    for k, row in enumerate(rows):
+        append_json_line(manifest, {**row, **change} if k == 2 else row)
+    again = carry_out(tmp_path / "d")
+    assert again.content_hash == whole.content_hash and again.index == whole.index
 
 
 def test_files_that_a_killed_process_was_writing_are_removed(carry_out, tmp_path):

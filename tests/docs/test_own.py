@@ -75,7 +75,7 @@ def test_what_is_one_s_own_goes_through_all_verbs(
     main(["play", "demo.h5", "--out", "film.mp4"])
     main(["report", "."])
     assert (folder / "film.mp4").exists() and (folder / "report.html").exists()
-    noted = {**references, **read_json(folder / "dataset" / "dataset.json")["config"]}
+    noted = {**references, **read_json(folder / "dataset" / "dataset.json", dict)["config"]}
     assert file in json.dumps(noted) and file in f"{noted[kind]}"
 
 

@@ -243,7 +243,7 @@ def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
     result = evaluate(
         Player(), short_task, config, out=out, progress=lambda *counts: progress.append(counts)
     )
-    assert read_json(out) == json.loads(json.dumps(result))
+    assert read_json(out, dict) == json.loads(json.dumps(result))
     assert result["task"] == "peg_in_hole" and result["backend"] == "pybullet"
     assert result["robot"] == "ur5e_2f85" and result["policy"] == "player"
     assert (result["n_episodes"], result["n_success"], result["success_rate"]) == (3, 0, 0.0)
@@ -290,7 +290,7 @@ def test_the_first_failures_are_handed_to_the_film_maker(evaluate, short_task, t
     assert result["videos"] == [
         {"path": f"videos/failure_{k:03d}.mp4", "episode": k, "outcome": "failure"} for k in (0, 1)
     ]
-    assert read_json(out)["videos"] == result["videos"]
+    assert read_json(out, dict)["videos"] == result["videos"]
     paths = [tmp_path / "e" / row["path"] for row in result["videos"]]
     assert [(path, k, outcome) for path, _, _, k, outcome in filmed] == [
         (paths[0], 0, "failure"),

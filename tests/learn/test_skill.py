@@ -7,10 +7,13 @@ import pytest
 import torch
 
 from sart_toolkit.data import storage
+from sart_toolkit.data.schemas import TrainingFile
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, OutputExists
 from sart_toolkit.learn.policy import Policy, PolicySetup
 from sart_toolkit.learn.samples import FRAMES
 from sart_toolkit.learn.skill import Skill, SkillConfig, load_skill, save_skill
+from sart_toolkit.learn.skillfiles import write_config
+from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.training import CHECKPOINT, train
 
 
@@ -24,7 +27,8 @@ def trained(dataset, small_config, tmp_path):
 def _edit(path, **changes):
     value = json.loads(path.read_text())
     value.update(changes)
-    path.write_text(json.dumps({k: v for k, v in value.items() if v is not None}))
+    value = {k: v for k, v in value.items() if v is not None}
+    path.write_text(json.dumps(storage.with_seal(value)))
 
 
 def test_a_skill_is_the_files_of_the_design(trained):
@@ -36,7 +40,7 @@ def test_a_skill_is_the_files_of_the_design(trained):
         "model.safetensors",
         "training.json",
     ]
-    training = storage.read_json(path / "training.json")
+    training = storage.read_json(path / "training.json", TrainingFile)
     assert [record["epoch"] for record in training["curve"]] == [1, 2, 3]
     assert training["final_loss"] == result.final_loss
     assert training["images_per_second"] > 0 and training["seconds"] > 0
@@ -277,7 +281,7 @@ def test_a_truncated_file_is_refused(trained, name):
         ({"colour": "red"}, "skill configuration: 'colour' is unknown"),
         ({"cameras": {}}, "cameras: expected wrist as in training, got none"),
         ({"cameras": {"wrist": {"size": [4, 5]}}}, "camera 'wrist' .* 'T_frame_camera' is missing"),
-        ({"cameras": 3}, "cameras: expected values by name, got 3"),
+        ({"cameras": 3}, "config.json: .*Expected `object`, got `int` - at `\\$.cameras`"),
         ({"cameras": {"wrist": 3}}, "camera 'wrist' .*: expected values by name, got 3"),
         ({"training": {"policy": "compact_mpl"}}, "training options: 'epochs' is missing"),
         ({"training": 3}, "config.json"),
@@ -304,18 +308,83 @@ def test_a_camera_is_checked_when_made(trained, change, message):
         dataclasses.replace(camera, **change)
 
 
-@pytest.mark.parametrize("name", ["demo.h5", "annotation.json", "model.safetensors"])
+@pytest.mark.parametrize(
+    "name", ["demo.h5", "annotation.json", "training.json", "model.safetensors"]
+)
 def test_files_of_different_skills_are_refused(trained, make_dataset, small_config, tmp_path, name):
     other = make_dataset(seed=7)
     save_skill(tmp_path / "other", train(other, small_config, tmp_path / "other"), other)
     shutil.copy(tmp_path / "other" / name, trained[0] / name)
-    with pytest.raises(Mismatch, match=f"{name}: belongs to another demonstration"):
+    with pytest.raises(Mismatch, match=f"{name}: (belongs to another demo|isn't the one that)"):
         load_skill(trained[0])
 
 
-def test_weights_of_another_policy_are_refused(trained, dataset, small_config, tmp_path):
+def test_weights_of_another_training_are_refused(trained, dataset, small_config, tmp_path):
     wide = dataclasses.replace(small_config, hidden=24)
     save_skill(tmp_path / "wide", train(dataset, wide, tmp_path / "wide"), dataset)
     shutil.copy(tmp_path / "wide" / "model.safetensors", trained[0] / "model.safetensors")
+    with pytest.raises(Mismatch, match="model.safetensors: isn't the one that config.json was"):
+        load_skill(trained[0])
+
+
+def _write_weights(path, tensors):
+    """Weights in a skill, with hashes that fit."""
+    save_tensors(path / "model.safetensors", tensors, {})
+    config = storage.read_json(path / "config.json", dict)
+    del config["files"]
+    write_config(path, config)
+
+
+def test_weights_that_do_not_fit_the_policy_are_refused(trained):
+    _write_weights(trained[0], {"weight": torch.zeros(3)})
     with pytest.raises(Mismatch, match="does not fit the policy in config.json"):
+        load_skill(trained[0])
+
+
+def test_weights_that_are_no_finite_numbers_are_neither_saved_nor_loaded(
+    trained, dataset, tmp_path
+):
+    path, result = trained
+    tensors, _ = load_tensors(path / "model.safetensors")
+    name = next(name for name, tensor in tensors.items() if tensor.is_floating_point())
+    for value in (torch.nan, torch.inf):
+        tensors[name].reshape(-1)[0] = value
+        _write_weights(path, tensors)
+        with pytest.raises(BrokenFile, match=f"weight '{name}' has NaN or infinite values"):
+            load_skill(path)
+        with torch.no_grad():
+            next(result.policy.parameters()).fill_(value)
+        with pytest.raises(InvalidInput, match="has NaN or infinite values, so it can't be saved"):
+            save_skill(tmp_path / "new", result, dataset)
+    assert not (tmp_path / "new" / "config.json").exists()
+
+
+def test_one_flipped_bit_of_a_weight_is_refused(trained):
+    path = trained[0] / "model.safetensors"
+    whole = path.read_bytes()
+    start = 8 + int.from_bytes(whole[:8], "little")
+    for at in np.linspace(start, len(whole) - 1, 40).astype(int):
+        flipped = bytearray(whole)
+        flipped[at] ^= 0x40
+        path.write_bytes(flipped)
+        with pytest.raises(BrokenFile, match="model.safetensors: content differs from its hash"):
+            load_skill(trained[0])
+
+
+@pytest.mark.parametrize("name", ["config.json", "training.json"])
+def test_a_changed_number_in_a_skill_s_json_is_refused(trained, name):
+    value = json.loads((trained[0] / name).read_text())
+    inside, key = (value, "seconds") if name == "training.json" else (value["training"], "epochs")
+    inside[key] += 1
+    (trained[0] / name).write_text(json.dumps(value))
+    with pytest.raises(BrokenFile, match=f"{name}: content differs from its hash"):
+        load_skill(trained[0])
+
+
+def test_an_annotation_that_was_edited_after_training_is_refused(trained):
+    path = trained[0] / "annotation.json"
+    value = json.loads(path.read_text())
+    value["spheres"][0]["radius_m"] *= 2
+    path.write_text(json.dumps(value))
+    with pytest.raises(Mismatch, match="annotation.json: isn't the one that config.json was"):
         load_skill(trained[0])

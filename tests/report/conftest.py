@@ -254,6 +254,7 @@ def edit_json() -> Callable[[Path, dict[str, Any]], None]:
     """Replace top-level keys of a JSON file."""
 
     def edit(path: Path, changes: dict[str, Any]) -> None:
-        path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+        value = {**json.loads(path.read_text()), **changes}
+        path.write_text(json.dumps(storage.with_seal(value) if "sha256" in value else value))
 
     return edit
