@@ -50,7 +50,7 @@ _SPEC.loader.exec_module(image)
 DRAWS = 30
 RADIUS = 0.18
 TRACKING_ERROR = PyBulletBackend.tracking_error
-MARGIN = AugmentConfig().margin + BODY_STILLNESS + TRACKING_ERROR
+MARGIN = round(AugmentConfig().margin + BODY_STILLNESS + TRACKING_ERROR, 9)
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +167,8 @@ def test_a_line_that_is_clear_is_the_same_by_either_strategy(straight, planned):
         if is_kept(straight[k]):
             (line, proof), (same, certificate) = straight[k], planned[k]
             np.testing.assert_array_equal(line.path.spline.c, same.path.spline.c)
-            assert (line.duration, proof) == (same.duration, certificate)
+            # The last digits of a distance hang on what was computed before.
+            assert (line.duration, proof.to_json()) == (same.duration, certificate.to_json())
 
 
 def test_a_bent_segment_leads_from_the_commanded_pose_of_t_star_to_the_sampled_pose(
