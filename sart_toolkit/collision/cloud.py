@@ -50,8 +50,9 @@ _KNOWN_SHARE, _WIDEST = 6.5 / 9, 5
 _ODD_DEVIATIONS, _ODD_LEAST, _CONTINUES = 2.5, 0.001, 5
 # It isn't alone if so many of its neighbours are as far away, to this fraction.
 _ALIKE, _ALIKE_SHARE, _IN_LINE = 2, 0.02, 3
-# Images are compared at every third pixel of each row and column, where they share so many.
-_SPARSE, _FEWEST = 3, 100
+# Images are compared at every third pixel of each row and column, where they share so many; so
+# many pairs say something of the camera. What moved once splits them in two: at most 2 / 3 differ.
+_SPARSE, _FEWEST, _FEWEST_PAIRS, _MOST = 3, 100, 6, 0.75
 # No image is more certain than this [m].
 _LEAST_OFF = 0.0001
 # So likely is it at most that as many images agree by chance with a pixel that shows nothing.
@@ -618,12 +619,14 @@ def _check_agreement(views: Sequence[_View], config: CloudConfig) -> None:
     """Return if the images of each camera show the same surfaces, or warn if not quite.
 
     What counts is the median by which depths differ from those that another image leads to, and
-    what is declared of the sensor explains. It finds only what differs between two poses.
+    what is declared of the sensor explains. It finds only what differs between two poses; what
+    moved before the camera differs as well, but not between most images.
 
     Raises:
-        Mismatch: they don't: the camera isn't where it is recorded to be.
+        Mismatch: most don't: the camera isn't where it is recorded to be.
     """
     worst, explained, camera = 0.0, 0.0, ""
+    pairs, contradicting = 0, 0
     for a, b in itertools.combinations(views, 2):
         if a.camera != b.camera:
             continue
@@ -641,16 +644,18 @@ def _check_agreement(views: Sequence[_View], config: CloudConfig) -> None:
         expected = float(np.median(b.off(z, config.sensor.deviation(z), 1.0)))
         if found - expected > worst - explained:
             worst, explained, camera = found, expected, a.camera
-        if found > expected + float(np.median(_tolerance(z, config.voxel))):
-            raise Mismatch(
-                f"camera {a.camera!r}: its images of waypoints {a.waypoint} and {b.waypoint} "
-                f"differ by {found * 1e3:.0f} mm from where they are said to be taken; calibrate "
-                "the camera, and see whether it is recorded on what it is mounted on, tool or world"
-            )
+        pairs += 1
+        contradicting += found > expected + float(np.median(_tolerance(z, config.voxel)))
+    if pairs >= _FEWEST_PAIRS and contradicting > _MOST * pairs:
+        raise Mismatch(
+            f"camera {camera!r}: {contradicting} of {pairs} pairs of its images contradict each "
+            f"other from where they are said to be taken, by up to {worst * 1e3:.0f} mm; calibrate "
+            "the camera, and see whether it is recorded on what it is mounted on, tool or world"
+        )
     if worst > explained:
         _log.warning(
-            "camera %r: images differ by %.1f mm, what is declared explains %.1f mm; calibrate it, "
-            "or declare more (--hand-eye-error, --depth-scale-error)",
+            "camera %r: images differ by %.1f mm, what is declared explains %.1f mm; if nothing "
+            "moved, calibrate it or declare more (--hand-eye-error, --depth-scale-error)",
             camera, worst * 1e3, explained * 1e3,
         )  # fmt: skip
 
