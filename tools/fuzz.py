@@ -41,7 +41,7 @@ import h5py
 import numpy as np
 
 from sart_toolkit.backends.states import pack_state, unpack_state
-from sart_toolkit.data import storage
+from sart_toolkit.data import storage, structure
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import (
     Annotation,
@@ -59,7 +59,8 @@ from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import SartError
 from sart_toolkit.poses import pose
 
-SECONDS, MEMORY_BYTES = 5.0, 500 * 10**6
+# Of computing time: a busy machine is slow by itself. What inspects HDF5 has its own 2 s of the 5.
+SECONDS, MEMORY_BYTES = 5.0 - structure.CPU_SECONDS, 500 * 10**6
 # How long nothing may come back before a process counts as hung.
 PATIENCE_SECONDS = 60.0
 CHUNK = 200
@@ -811,7 +812,7 @@ class Bench:
         before = _address_space()
         _, most = resource.getrlimit(resource.RLIMIT_AS)
         resource.setrlimit(resource.RLIMIT_AS, (before + MEMORY_BYTES, most))
-        detail, started = "", time.perf_counter()
+        detail, started = "", time.process_time()
         try:
             outcome = self._compare(loader, loader.read(at), what, forged)
         except SartError as error:
@@ -821,7 +822,7 @@ class Bench:
             detail = "".join(traceback.format_exception(error))[-1500:]
         finally:
             resource.setrlimit(resource.RLIMIT_AS, (most, most))
-        seconds = time.perf_counter() - started
+        seconds = time.process_time() - started
         if seconds > SECONDS:
             outcome = "slow"
         return {"outcome": outcome, "seconds": seconds, "detail": detail}
