@@ -929,6 +929,7 @@ class Process:
 def all_rows(seed: int, count: int, workers: int) -> Iterator[dict[str, Any]]:
     """What comes of the first `count` mutations, in any order."""
     chunks, found = iter(range(0, count, CHUNK)), queue.SimpleQueue[dict[str, Any] | None]()
+    ended = threading.Event()
     lock, processes = threading.Lock(), [Process() for _ in range(workers)]
 
     def work(process: Process) -> None:
@@ -940,6 +941,10 @@ def all_rows(seed: int, count: int, workers: int) -> Iterator[dict[str, Any]]:
                     return
                 for row in process.rows(seed, first, min(first + CHUNK, count)):
                     found.put(row)
+        except (OSError, ValueError):
+            # Its pipes are closed where all of it is interrupted.
+            if not ended.is_set():
+                raise
         finally:
             found.put(None)
 
@@ -954,6 +959,7 @@ def all_rows(seed: int, count: int, workers: int) -> Iterator[dict[str, Any]]:
             else:
                 yield row
     finally:
+        ended.set()
         for process in processes:
             process.close()
 
@@ -971,7 +977,8 @@ def summary(rows: Iterator[dict[str, Any]], progress: Callable[[int], None]) -> 
             tables[row["loader"]][row["outcome"]] += 1
             slowest[row["loader"]] = max(slowest[row["loader"]], row["seconds"])
             if row["outcome"] in BAD:
-                failures.append(row)
+                # `--only` shows its details, which name places on this machine.
+                failures.append({k: v for k, v in row.items() if k != "detail"})
             done += 1
             progress(done)
     failures.sort(key=lambda row: row["i"])
