@@ -56,6 +56,7 @@ SCHEMA_VERSION = 5
 # The largest files that are read as JSON, and as lines of JSON.
 MAX_JSON_BYTES = 16 * 2**20
 MAX_LINES_BYTES = 256 * 2**20
+_MAX_DEPTH = 50
 
 # As `replacing` names them, with the eight characters of `mkstemp`.
 _TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}(\.(?!lock)\w+)?")
@@ -210,6 +211,7 @@ def parse_json(content: bytes, what: str) -> Any:
     try:
         value = msgspec.json.decode(content)
         json.loads(content, object_pairs_hook=_once_each, parse_int=_whole)
+        _check_depth(value, _MAX_DEPTH)
     except (ValueError, RecursionError, msgspec.MsgspecError) as error:
         raise BrokenFile(
             f"{what}: not readable as JSON ({error}); fix it or make it again"
@@ -222,6 +224,15 @@ def _once_each(pairs: list[tuple[str, Any]]) -> None:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{twice[:40]!r} stands there twice")
+
+
+def _check_depth(value: Any, left: int) -> None:
+    if left == 0:
+        raise ValueError(f"nested more than {_MAX_DEPTH} deep")
+    inside = value.values() if isinstance(value, dict) else value
+    if isinstance(value, dict | list):
+        for deeper in inside:
+            _check_depth(deeper, left - 1)
 
 
 def _whole(digits: str) -> None:

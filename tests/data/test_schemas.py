@@ -57,6 +57,7 @@ RUN = {"config": {}, "stages": {"record": 1.0}}
         ('{"a": ' * 100_000, "recursion"),
         (r'{"a": "\ud800"}', "truncated"),
         ('{"a": 1, "b": {"c": 1, "c": 2}}', "'c' stands there twice"),
+        ('{"a": ' + "[" * 50 + "]" * 50 + "}", "nested more than 50 deep"),
         ('{"a": 1} x', "trailing"),
         ("\ufeff{}", "invalid character"),
     ],
