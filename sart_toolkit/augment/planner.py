@@ -150,6 +150,10 @@ def path_deviation(
     # In these units of length all joints count alike.
     reach = placed.bounds.reach.max(0, initial=0.0)
     along = motion.path.positions(np.linspace(0.0, 1.0, _PATH_SAMPLES))
-    on_path = np.concatenate([approach, along]) * reach
     measured = joint_path * reach
-    return float(np.abs(measured - nearest_on_polyline(measured, on_path)).sum(1).max())
+    # Of each by itself: where they meet they may turn back.
+    off = [
+        np.abs(measured - nearest_on_polyline(measured, part * reach)).sum(1)
+        for part in (approach, along)
+    ]
+    return float(np.minimum(*off).max())

@@ -137,7 +137,8 @@ def stated(**changes):
 def understated(episode):
     """As if the robot had been declared to follow exactly."""
     proof = episode.provenance.certificate
-    commanded = {**proof["commanded"], "margin": round(AugmentConfig().margin + BODY_STILLNESS, 9)}
+    margin = round(AugmentConfig().margin + BODY_STILLNESS, 9)
+    commanded = {**proof["commanded"], "margin": margin, "clearance": margin}
     return stated(tracking_error=0.0, commanded=commanded)(episode)
 
 
@@ -176,7 +177,7 @@ def steps(**changes):
         (understated, "more than the tracking error of 0.000 mm that was proved for"),
         (stated(tracking_error=0.0003), "commanded path is proved"),
         (stated(tracking_error="none"), "tracking_error: expected a length >= 0 m, got 'none'"),
-        (stated(deviation=float("nan")), "deviation: expected a length >= 0 m, got nan"),
+        (stated(deviation=-0.001), "deviation: expected a length >= 0 m, got -0.001"),
         (stated(body_stillness=0.0), "proved for bodies that move by other than 0.1 mm"),
         (certificate("measured", margin=0.0), "measured path is proved"),
         (certificate("commanded", nonsense=1), "certificate: a field is missing or unknown"),
