@@ -140,10 +140,13 @@ def _on_robot(points: Array, world: ExactWorld, waypoints: Sequence[int]) -> int
 def benchmark_noise(
     cells: Sequence[Cell],
     draws: int,
+    out: Path,
     seed: int = 0,
     recordings: Mapping[str, Recording] = RECORDINGS,
     workers: int = 1,
+    overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    about: Mapping[str, Any] = _NOTHING,
 ) -> dict[str, Any]:
     """For each cell and sensor, radii from noisy images against those from the true scene.
 
@@ -155,35 +158,50 @@ def benchmark_noise(
     Args:
         cells: tasks and backends; the backends draw images.
         draws: of the noise.
+        out: JSON file to write; finished cells are kept beside it until all are done.
         seed: of the scripted operator and of the noise.
         recordings: the sensors by name.
         workers: processes.
+        overwrite: replace `out`, and forget finished cells.
         progress: called with (cells done, cells in all).
+        about: what else is to stand in the file, such as the command.
+
+    Raises:
+        OutputExists: `out` is there and `overwrite` is false.
+        Mismatch: it was interrupted with other settings.
+        CannotWrite: the disk refuses.
     """
     check_positive("draws", draws)
-    sizes, rows = {}, {}
-    work = functools.partial(_NoiseCell, cells, draws, seed, recordings)
-    with worker_map(work, workers) as run:
-        names = [cell.name for cell in cells]
-        for name, (size, found) in zip(names, run(names), strict=True):
-            sizes[name], rows[name] = size, found
-            if progress is not None:
-                progress(len(rows), len(cells))
-    return {
-        "draws": draws,
-        "seed": seed,
-        "image_size": sizes,
-        "recordings": {name: dataclasses.asdict(each) for name, each in recordings.items()},
-        "total": {
-            name: _noise_totals([row for cell in rows.values() for row in cell[name]])
-            for name in recordings
-        },
-        "cells": {
-            cell: {name: _noise_totals(of) | {"draws": of} for name, of in by_name.items()}
-            for cell, by_name in rows.items()
-        },
-        "versions": library_versions(),
-    }
+    described = {name: dataclasses.asdict(each) for name, each in recordings.items()}
+    asked = {"benchmark": "noise", "seed": seed, "draws": draws, "recordings": described}
+    names = [cell.name for cell in cells]
+    with ResultLog(out, asked, overwrite) as log:
+        done = {row["cell"]: row for row in log.rows}
+        missing = [name for name in names if name not in done]
+        work = functools.partial(_NoiseCell, cells, draws, seed, recordings)
+        with worker_map(work, workers) as run:
+            for name, (size, found) in zip(missing, run(missing), strict=True):
+                done[name] = {"cell": name, "size": size, "found": found}
+                log.add(done[name])
+                if progress is not None:
+                    progress(sum(name in done for name in names), len(cells))
+        rows = {name: done[name]["found"] for name in names}
+        return log.finish({
+            **about,
+            "draws": draws,
+            "seed": seed,
+            "image_size": {name: done[name]["size"] for name in names},
+            "recordings": described,
+            "total": {
+                name: _noise_totals([row for cell in rows.values() for row in cell[name]])
+                for name in recordings
+            },
+            "cells": {
+                cell: {name: _noise_totals(of) | {"draws": of} for name, of in by_name.items()}
+                for cell, by_name in rows.items()
+            },
+            "versions": library_versions(),
+        })  # fmt: skip
 
 
 class _NoiseCell:

@@ -167,10 +167,10 @@ def cloud_verb(args: BenchmarkCloud) -> Result:
     if args.noise:
         with ProgressDisplay() as progress:
             result = benchmark_noise(
-                cells, args.noise, args.seed, workers=args.workers,
-                progress=lambda done, wanted: progress("cloud", done, wanted),
+                cells, args.noise, args.out, args.seed, workers=args.workers,
+                overwrite=args.overwrite,
+                progress=lambda done, wanted: progress("cloud", done, wanted), about=_about(),
             )  # fmt: skip
-        write_json(args.out, _about() | result)
         return {"benchmark": str(args.out)} | {
             name: f"{row['n_larger']} of {row['n_radii']} radii too large; "
             f"{row['median_share']:.0%} of the exact radii at the median, "

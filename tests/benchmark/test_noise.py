@@ -13,6 +13,7 @@ from sart_toolkit.benchmark.clouds import Recording, _allowed, _noise_totals, be
 from sart_toolkit.benchmark.noise import as_measured
 from sart_toolkit.collision.sensor import SensorErrors, sensor_errors
 from sart_toolkit.data.records import PrecisionSphere
+from sart_toolkit.errors import Mismatch
 from sart_toolkit.poses import distance
 from sart_toolkit.robots import get_robot
 
@@ -87,14 +88,14 @@ def test_a_radius_between_two_probed_ones_is_right_if_it_passes_itself(monkeypat
         assert _allowed(world, [sphere], [0.1], [other]) == [allowed]
 
 
-def test_a_cell_s_radii_from_noisy_images_stand_beside_the_exact_ones(peg_task):
+def test_a_cell_s_radii_from_noisy_images_stand_beside_the_exact_ones(peg_task, tmp_path):
     make = functools.partial(
         make_backend, "pybullet", get_robot(peg_task.robot), peg_task.scene, 48
     )
     recordings = {"off": Recording.honest("exact")}
     seen = []
     found = benchmark_noise(
-        [Cell(peg_task, "pybullet", make)], 1, recordings=recordings,
+        [Cell(peg_task, "pybullet", make)], 1, tmp_path / "n.json", recordings=recordings,
         progress=lambda done, wanted: seen.append((done, wanted)),
     )  # fmt: skip
     assert seen == [(1, 1)] and found["image_size"] == {"peg_in_hole/pybullet": [48, 48]}
@@ -102,3 +103,35 @@ def test_a_cell_s_radii_from_noisy_images_stand_beside_the_exact_ones(peg_task):
     (draw,) = row["draws"]
     assert row["n_radii"] == len(draw["exact"]) == len(draw["cloud"]) >= 2
     assert row["n_larger"] == 0 and found["total"]["off"]["n_radii"] == row["n_radii"]
+
+
+def test_an_interrupted_noise_table_keeps_the_cells_that_were_finished(
+    peg_task, tmp_path, monkeypatch
+):
+    done = []
+
+    class Cells:
+        def __init__(self, *_):
+            pass
+
+        def __call__(self, name):
+            done.append(name)
+            row = {"exact": [0.01], "allowed": [0.01], "cloud": [0.008], "seconds": 1.0}
+            return [48, 48], {"off": [row]}
+
+        def close(self):
+            pass
+
+    def cut(finished, wanted):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(clouds, "_NoiseCell", Cells)
+    cells = [Cell(peg_task, backend, None) for backend in ("one", "two")]
+    out, recordings = tmp_path / "n.json", {"off": Recording.honest("exact")}
+    with pytest.raises(KeyboardInterrupt):
+        benchmark_noise(cells, 1, out, recordings=recordings, progress=cut)
+    with pytest.raises(Mismatch, match="add --overwrite"):
+        benchmark_noise(cells, 2, out, recordings=recordings)
+    found = benchmark_noise(cells, 1, out, recordings=recordings)
+    assert done == ["peg_in_hole/one", "peg_in_hole/two"] == list(found["cells"])
+    assert found["total"]["off"]["n_radii"] == 2 and out.exists()
