@@ -189,7 +189,7 @@ def make_results(root: Path) -> None:
         "config": {"policy": "compact_mlp"},
     }
     storage.write_json(root / "evaluation" / "training.json", training)
-    log = root / "result log" / "out.partial.jsonl"
+    log = root / "result log" / "out.json.journal"
     log.parent.mkdir()
     for row in (REQUEST, {"cell": "a", "seconds": 1.5}, {"cell": "b", "seconds": 2.5}):
         storage.append_json_line(log, row)
@@ -302,9 +302,10 @@ def read_evaluation(at: Path) -> Fingerprint:
 
 def read_result_log(at: Path) -> Fingerprint:
     """What a benchmark that was interrupted left."""
-    from sart_toolkit.benchmark.result_log import ResultLog
+    from sart_toolkit.data.result_log import ResultLog
 
-    return {"covered": None, "rest": ResultLog(at / "out.json", REQUEST, overwrite=False).rows}
+    with ResultLog(at / "out.json", REQUEST, overwrite=False) as log:
+        return {"covered": None, "rest": log.rows}
 
 
 def read_state(at: Path) -> Fingerprint:
@@ -738,6 +739,7 @@ def mutate(directory: Path, rng: Rng) -> tuple[str, bool]:
     special = {
         ".json": mutate_json_file,
         ".jsonl": mutate_lines,
+        ".journal": mutate_lines,
         ".h5": mutate_hdf5,
         ".safetensors": mutate_tensors,
         ".urdf": mutate_urdf,
@@ -749,7 +751,7 @@ def mutate(directory: Path, rng: Rng) -> tuple[str, bool]:
         what, content = mutate_bytes(path.read_bytes(), rng)
         forged = path.suffix == ".urdf" or path.name == "annotation.json"
         # Where the last line of a log is cut short, it counts as never written.
-        forged = forged or path.name.endswith(".partial.jsonl")
+        forged = forged or path.name.endswith(".journal")
         path.write_bytes(content)
     return f"{path.name}: {what}", forged
 
