@@ -20,7 +20,7 @@ from sart_toolkit.data.storage import (
     save_demonstration,
 )
 from sart_toolkit.errors import Discarded, NoDisplay
-from sart_toolkit.motion.controller import ControllerConfig
+from sart_toolkit.motion.config import ControllerConfig
 from sart_toolkit.record.checks import check_recording
 from sart_toolkit.record.desk import RecordingDesk
 from sart_toolkit.record.devices.manual import ManualDevice

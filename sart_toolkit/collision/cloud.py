@@ -23,6 +23,7 @@ from scipy.stats import binom
 
 from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.parts import robot_parts
+from sart_toolkit.collision.phases import IN_GRASP_SLIP
 from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
 from sart_toolkit.data.records import Demonstration, Image, summary
 from sart_toolkit.errors import InvalidInput, Mismatch, unknown_name
@@ -188,14 +189,14 @@ class _OwnBody:
         """Which points `(n, 3)` the robot covers at waypoint `t`, grown by a margin [m].
 
         There may be a margin `(n,)` for each point. What is grasped is grown by `unsure` times its
-        error too.
+        error and what it may slip in the grasp too.
         """
         model = self._model(float(self._steps.measured_gripper[t]))
         Ts_link = model.link_poses(self._steps.joint_positions[t])
         hulls = [(hull, Ts_link[link], 0.0) for link, hull in self._parts]
         T_tool = self._steps.measured_Ts_world_tool[t]
         hulls += [
-            (hull, T_tool, unsure * each.error)
+            (hull, T_tool, unsure * (each.error + IN_GRASP_SLIP))
             for each, hull in self._grasped
             if t in each.waypoints
         ]
@@ -905,7 +906,8 @@ def grasped_object(
             gone |= view.through(p_world, config.voxel)
     # A floor that the tool moves along would look as well as if it came with it.
     better = rode.mean() < stayed.mean() - config.voxel / 4
-    mine = gone | ((rode.mean() <= config.voxel) & better)
+    # It may have slipped in the grasp on the way.
+    mine = gone | ((rode.mean() <= config.voxel + IN_GRASP_SLIP) & better)
     if not mine.any():
         return None
     points = p_tool[mine]

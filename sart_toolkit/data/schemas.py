@@ -100,7 +100,7 @@ class DatasetFile(msgspec.Struct):
     task: Name | UnsetType = UNSET
     robot: Name | UnsetType = UNSET
     seconds: Seconds | None | UnsetType = UNSET
-    simulated_seconds: Seconds | UnsetType = UNSET
+    simulated_seconds: Seconds | None | UnsetType = UNSET
     config: Values | UnsetType = UNSET
     references: References | UnsetType = UNSET
 

@@ -453,7 +453,11 @@ class Journal:
                 linked(path).parent.mkdir(parents=True, exist_ok=True)
                 self._file = open(self.path, "ab+")  # noqa: SIM115 - open until `close`
                 _drop_cut_line(self._file)
-            self.rows = read_json_lines(self.path) if read else []
+            try:
+                self.rows = read_json_lines(self.path) if read else []
+            except BaseException:
+                self._file.close()
+                raise
         except BaseException:
             self._lock.close()
             raise
@@ -820,10 +824,12 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
             bodies[name] = Ts
         file["states/sizes"] = np.array([len(state) for state in d.states], dtype="<i8")
         # States are nearly alike, and farther apart than the windows of HDF5's filters reach.
-        packed = lzma.compress(b"".join(d.states), preset=0)
+        packed = lzma.compress(b"".join(d.states), filters=_STATES_FILTERS)
         file["states/xz"] = np.frombuffer(packed, dtype=np.uint8)
 
 
+# The dictionary holds several states, so that the next is found to be like the last.
+_STATES_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 0, "dict_size": 8 * 2**20}]
 # States may be so much larger than they are packed, and a few always so large.
 _STATES_RATIO = 1000
 _STATES_BYTES = 256 * 2**20

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import InvalidInput, MotionRejected
+from sart_toolkit.motion.config import ControllerConfig
 from sart_toolkit.motion.interpolator import JointInterpolator
 from sart_toolkit.poses import (
     Array,
     angle_between,
     check_array,
     check_pose,
-    check_positive,
     distance,
     exp_rotation,
     interpolate,
@@ -26,25 +24,6 @@ from sart_toolkit.robots.model import RobotModel
 # So much of the lead that was allowed for the joints' lag is left a control period later.
 _FADING = 0.8
 _NO_LEAD = 1e-9
-
-
-@dataclass(frozen=True)
-class ControllerConfig:
-    """Bounds of the `ToolController`.
-
-    `max_lead` [m], `max_lead_deg`: how far the commanded pose may be from the measured one.
-    `max_joint_step` [rad]: how far, at most, a joint's goal may be from the one before; a farther
-    one is on another branch of the arm. (How fast the joints then move, the robot's limits say.)
-    """
-
-    max_lead: float = 0.020
-    max_lead_deg: float = 5.0
-    max_joint_step: float = 0.35
-
-    def __post_init__(self) -> None:
-        check_positive("max_lead", self.max_lead, "m")
-        check_positive("max_lead_deg", self.max_lead_deg, "deg")
-        check_positive("max_joint_step", self.max_joint_step, "rad")
 
 
 class ToolController:

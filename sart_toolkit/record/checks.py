@@ -9,7 +9,7 @@ import numpy as np
 
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.motion.controller import ControllerConfig
+from sart_toolkit.motion.config import ControllerConfig
 from sart_toolkit.poses import Array, check_positive
 from sart_toolkit.robots.spec import RobotSpec
 

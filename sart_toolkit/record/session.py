@@ -29,7 +29,8 @@ from sart_toolkit.backends.interface import (
 )
 from sart_toolkit.data.records import Demonstration, Judge, library_versions
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
-from sart_toolkit.motion.controller import ControllerConfig, ToolController
+from sart_toolkit.motion.config import ControllerConfig
+from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.poses import Array, apply_motion, check_array, check_positive, frozen
 from sart_toolkit.record.recorder import StepRecorder
 from sart_toolkit.registry import reference_to

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import Array, pose
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape, look_at
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
 from sart_toolkit.tasks.task import Placement, PlanStep, Task
+
+if TYPE_CHECKING:
+    from sart_toolkit.robots.model import RobotModel
 
 PANEL_THICKNESS, PANEL_WIDTH, PANEL_HEIGHT = 0.01, 0.29, 0.18
 BAR_RADIUS, BAR_LENGTH, BAR_HEIGHT = 0.0075, 0.06, 0.17

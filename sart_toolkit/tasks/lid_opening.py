@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import Array, pose
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape, look_at
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
 from sart_toolkit.tasks.task import Placement, PlanStep, Task
+
+if TYPE_CHECKING:
+    from sart_toolkit.robots.model import RobotModel
 
 LID_DEPTH, LID_WIDTH, LID_THICKNESS = 0.20, 0.32, 0.01
 NOTCH_DEPTH, NOTCH_WIDTH = 0.04, 0.10

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,11 @@ from sart_toolkit.backends.interface import KnowsBodies, Observation
 from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, pose
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
+
+if TYPE_CHECKING:
+    from sart_toolkit.robots.model import RobotModel
 
 
 @dataclass(frozen=True)

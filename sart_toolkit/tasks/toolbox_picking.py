@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.poses import Array, inverse, pose
-from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
 from sart_toolkit.scenes.spec import Body, SceneSpec, SceneState
 from sart_toolkit.tasks.parts import OVERVIEW, TABLE, tool_down
 from sart_toolkit.tasks.task import Placement, PlanStep, Task
+
+if TYPE_CHECKING:
+    from sart_toolkit.robots.model import RobotModel
 
 BOX_WIDTH, BOX_HEIGHT = 0.12, 0.08
 BAR_WIDTH, BAR_LENGTH = 0.016, 0.08

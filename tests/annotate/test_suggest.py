@@ -194,7 +194,7 @@ def test_a_little_larger_than_suggested_some_pose_would_touch(
         T_world_joint = placed.joint_poses(q_key)[-1]
         gap = Gap.of(placed, pair, placed.witness(q_key, pair), T_world_joint)
         corners = gap.points[np.argsort(gap.points @ gap.normal)[:4]]
-        grown, least = 1.15 * sphere.radius, np.inf
+        grown, least = 1.25 * sphere.radius, np.inf
         for _ in range(400):
             axis = np.cross(corners[rng.integers(4)], gap.normal)
             axis = axis / np.linalg.norm(axis) + rng.normal(0, 0.3, 3)

@@ -930,8 +930,9 @@ def test_a_demonstration_without_states_is_refused(
     peg_demonstration, peg_annotation, make_peg_backend, tmp_path
 ):
     bare = dataclasses.replace(peg_demonstration, states=())
+    spheres = dataclasses.replace(peg_annotation, demonstration_hash=bare.content_hash())
     with pytest.raises(Mismatch, match="holds no saved states"):
-        augment_demonstration(bare, peg_annotation, make_peg_backend, tmp_path / "d")
+        augment_demonstration(bare, spheres, make_peg_backend, tmp_path / "d")
     assert not (tmp_path / "d").exists()
 
 

@@ -606,5 +606,5 @@ def test_a_joint_without_limits_is_refused(monkeypatch, tmp_path):
     for mesh in Path(model.urdf).parent.glob("*.obj"):
         (tmp_path / mesh.name).symlink_to(mesh)
     monkeypatch.setattr("sart_toolkit.robots.model.composed_urdf", lambda *_: broken)
-    with pytest.raises(InvalidInput, match="turns without end"):
+    with pytest.raises(InvalidInput, match="is continuous, expected one with limits"):
         SapienBackend(get_robot("ur5e_hande"), SceneSpec(()), 16)

@@ -26,7 +26,7 @@ from sart_toolkit.testing.closest import ClosestPoints
 
 PEG = "peg_in_hole/pybullet"
 LID = "lid_closing/pybullet"
-FEW = RadiiConfig(draws=40, directed=400)
+FEW = RadiiConfig(draws=40, directed=400, growth=1.25)
 
 
 class Interrupted(Exception):
@@ -47,7 +47,7 @@ def test_suggested_spheres_hold_no_collision_and_somewhat_larger_ones_do(
         assert (row["draws"], row["collisions"], row["unreachable"]) == (40, 0, 0)
         # The two models agree wherever both look at the nearest pair.
         assert 0.0 < row["least_mm"] <= row["least_checked_mm"] + 0.1
-        assert row["grown"]["radius"] == pytest.approx(1.15 * sphere.radius)
+        assert row["grown"]["radius"] == pytest.approx(1.25 * sphere.radius)
         assert row["grown"]["collided"] and row["grown"]["within_margin"]
         assert row["grown"]["least_mm"] < 0.0
 

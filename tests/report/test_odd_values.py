@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from sart_toolkit.data.storage import with_seal
 from sart_toolkit.errors import SartError
 from sart_toolkit.report.page import write_report
 
@@ -44,7 +45,7 @@ def test_a_value_of_another_kind_is_shown_or_refused(
     outcomes = {True: 0, False: 0}
     for number, at in enumerate(_places(whole)):
         # Not each in each place: the figures take a while.
-        file.write_text(json.dumps(_replaced(whole, at, ODD[number % len(ODD)])))
+        file.write_text(json.dumps(with_seal(_replaced(whole, at, ODD[number % len(ODD)]))))
         try:
             write_report(tmp_path / "odd", tmp_path / "page.html")
         except SartError:

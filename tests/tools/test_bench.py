@@ -55,9 +55,9 @@ def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
     out, err = capsys.readouterr()
     figures = json.loads(out.splitlines()[-1])["figures"]
     assert figures["kept"] == 1 and figures["attempted"] >= 1
-    # Each attempt simulates two seconds.
+    # Each attempt simulates two seconds, and before them the short way to a rest.
     tries_per_second = figures["attempted"] * figures["kept_trajectories_per_second"]
-    assert figures["simulated_over_wall"] == pytest.approx(2 * tries_per_second)
+    assert 2.0 <= figures["simulated_over_wall"] / tries_per_second < 2.3
     assert "turn 1/1" in err
 
 
