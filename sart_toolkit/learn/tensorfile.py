@@ -36,15 +36,20 @@ def tensors_digest(tensors: Mapping[str, Tensor], about: str = "") -> str:
     return sha.hexdigest()
 
 
+def _sealed(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> str:
+    return tensors_digest(tensors, json.dumps(dict(about), sort_keys=True, allow_nan=False))
+
+
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
     """Write tensors by name, and `about` as JSON in the file's header.
 
     Raises:
         CannotWrite: the disk refuses; `path` is as it was.
     """
-    header = json.dumps({"schema_version": SCHEMA_VERSION, **about}, allow_nan=False)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    metadata = {_KEY: header, "sha256": tensors_digest(tensors, header)}
+    header = {"schema_version": SCHEMA_VERSION, **about, "sha256": _sealed(tensors, about)}
+    # One entry: those of several would stand in another order each time.
+    metadata = {_KEY: json.dumps(header, allow_nan=False)}
     with replacing(path) as temporary:
         try:
             save_file(tensors, temporary, metadata=metadata)
@@ -68,14 +73,13 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     try:
         _check_header(path)
         with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            header, sha256 = metadata[_KEY], metadata.get("sha256")
-            about = parse_json(header.encode(), str(path))
+            about = parse_json((file.metadata() or {})[_KEY].encode(), str(path))
             if not isinstance(about, dict):
                 raise ValueError("its header holds no JSON object")
             check_schema(path, about.pop("schema_version", None))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        found = tensors_digest(tensors, header)
+        sha256 = about.pop("sha256", None)
+        found = _sealed(tensors, about)
     except BrokenFile:
         raise
     except (

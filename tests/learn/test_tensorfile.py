@@ -1,5 +1,7 @@
 import json
 import resource
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -71,3 +73,18 @@ def test_a_disk_that_fills_up_is_an_error_of_ours_and_leaves_the_old_file(tmp_pa
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_the_same_tensors_give_the_same_bytes(tmp_path):
+    """In every process: the order of what a header holds must not be left to chance."""
+    code = (
+        "import sys, torch; from pathlib import Path\n"
+        "from sart_toolkit.learn.tensorfile import save_tensors\n"
+        "save_tensors(Path(sys.argv[1]), {'a': torch.ones(3), 'b': torch.zeros(2)}, {'n': 1})"
+    )
+    contents = set()
+    for i in range(4):
+        path = tmp_path / f"{i}.safetensors"
+        subprocess.run([sys.executable, "-c", code, str(path)], check=True)
+        contents.add(path.read_bytes())
+    assert len(contents) == 1
