@@ -25,6 +25,7 @@ import numpy as np
 
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import library_versions
+from sart_toolkit.data.schemas import EvaluationFile
 from sart_toolkit.data.storage import read_json, write_json
 from sart_toolkit.doctor import machine
 from sart_toolkit.errors import Mismatch
@@ -78,11 +79,11 @@ def _hash_of_weights(path: Path) -> str:
 
 
 def _hash_of_evaluation(path: Path) -> str:
-    return _digest(_without(read_json(path), "seconds", "versions"))
+    return _digest(_without(read_json(path, EvaluationFile), "seconds", "versions"))
 
 
 def _hash_of_segments(path: Path) -> str:
-    result = read_json(path)
+    result = read_json(path, dict)
     kept = {key: result[key] for key in ("config", "total", "cells")}
     return _digest(_without(kept, "tries_per_second_and_process"))
 

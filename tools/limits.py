@@ -93,7 +93,7 @@ def _resumed(options: argparse.Namespace, name: str) -> dict[str, Any]:
     asked = {
         key: getattr(options, key) for key in ("n", "epochs", "rollouts", "wild", "seed", "backend")
     } | {"eval_seed": options.eval_seed}
-    if file.exists() and (found := read_json(file)).get("asked") == asked:
+    if file.exists() and (found := read_json(file, dict)).get("asked") == asked:
         return found
     row = _checked(options, name) | {"asked": asked}
     write_json(file, row)

@@ -155,9 +155,10 @@ class LateJoints(PyBulletBackend):
     def step(self) -> None:
         commanded = self._targets.rows[-1]
         half = 0.5 * (self._targets.last + commanded)
-        self._targets.rows = np.linspace(self._targets.last, half, len(self._targets.rows) + 1)[1:]
+        steps = len(self._targets.rows)
+        self._targets.rows = np.linspace(self._targets.last, half, steps + 1)[1:]
         super().step()
-        self._targets.rest_at(commanded[:-1], commanded[-1])
+        self._targets.rows = np.repeat(commanded[None], steps, axis=0)
 
 
 class WrongClock(PyBulletBackend):
@@ -233,12 +234,13 @@ class InstancesShareTargets(PyBulletBackend):
 
     def command(self, q: Array, gripper: float) -> CommandSent:
         sent = super().command(q, gripper)
-        InstancesShareTargets._everybody_s = self._targets.rows
+        InstancesShareTargets._everybody_s = self._targets.rows[-1]
         return sent
 
     def step(self) -> None:
         if self._everybody_s is not None:
-            self._targets.rows = self._everybody_s
+            last, steps = self._targets.last, len(self._targets.rows)
+            self._targets.rows = np.linspace(last, self._everybody_s, steps + 1)[1:]
         super().step()
 
 
