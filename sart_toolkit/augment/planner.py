@@ -42,6 +42,8 @@ class SegmentPlanner:
         self.world = world
         self._annotation, self._config, self._source = annotation, config, source
         self._approaches: dict[int, Array] = {}
+        # What is proved of them, by waypoint and margin: all segments from a waypoint share it.
+        self._approach_proofs: dict[tuple[int, float], Certificate] = {}
 
     def proposal(self, sphere: int, k: int) -> tuple[Proposal, np.random.Generator]:
         """The k-th draw from a sphere, and the random numbers that follow.
@@ -101,7 +103,10 @@ class SegmentPlanner:
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
         T_goal = proposal.T_world_sampled
         self.world.check_known(t)
-        approach = self.world.certify(t, PolylinePath(self.approach(t)), margin)
+        if (t, margin) not in self._approach_proofs:
+            proof = self.world.certify(t, PolylinePath(self.approach(t)), margin)
+            self._approach_proofs[t, margin] = proof
+        approach = self._approach_proofs[t, margin]
         approach.check_free()
         try:
             motion = straight_line(

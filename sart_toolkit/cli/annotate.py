@@ -31,6 +31,7 @@ from sart_toolkit.errors import (
 )
 
 if TYPE_CHECKING:
+    from sart_toolkit.collision.sensor import SensorErrors
     from sart_toolkit.annotate.session import AnnotationSession
 
 _WITHOUT = "or work without a window: --text, or --suggest-all --no-window"
@@ -39,16 +40,18 @@ _WITHOUT = "or work without a window: --text, or --suggest-all --no-window"
 def annotate_verb(args: Annotate) -> dict[str, Any]:
     """`sart annotate`."""
     pipeline.check_names(task=args.task, robot=args.robot)
-    declared_sensor(args)
+    sensor = declared_sensor(args)
     headless = args.no_window and not args.text
     if headless and not args.suggest_all:
         raise InvalidInput("--no-window: leaves nothing to do; add --suggest-all, or --text")
     out = args.out or args.demo.with_name(f"{args.demo.stem}.annotation.json")
     with OutputLock(out) as lock:
-        return _annotate(args, out, headless, lock)
+        return _annotate(args, out, headless, lock, sensor)
 
 
-def _annotate(args: Annotate, out: Path, headless: bool, lock: OutputLock) -> dict[str, Any]:
+def _annotate(
+    args: Annotate, out: Path, headless: bool, lock: OutputLock, sensor: SensorErrors | None
+) -> dict[str, Any]:
     with _window_probe(wanted=not (args.text or args.no_window)) as probe:
         demonstration = pipeline.noted(load_demonstration(args.demo), args.task, args.robot)
         # Not before the demonstration is read: these imports take a second.
@@ -75,7 +78,7 @@ def _annotate(args: Annotate, out: Path, headless: bool, lock: OutputLock) -> di
         )
         world = pipeline.world_of(
             demonstration, args.source, args.unknown, args.slip_tolerance, args.task, args.robot,
-            declared_sensor(args),
+            sensor,
         )  # fmt: skip
         if probe is not None and not (finding := probe.result()).ok:
             raise MissingCapability(f"no window: {finding.detail}; {finding.remedy}; {_WITHOUT}")
