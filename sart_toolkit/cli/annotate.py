@@ -31,8 +31,8 @@ from sart_toolkit.errors import (
 )
 
 if TYPE_CHECKING:
-    from sart_toolkit.collision.sensor import SensorErrors
     from sart_toolkit.annotate.session import AnnotationSession
+    from sart_toolkit.collision.sensor import SensorErrors
 
 _WITHOUT = "or work without a window: --text, or --suggest-all --no-window"
 
