@@ -66,7 +66,7 @@ class SegmentExecutor(abc.ABC):
     def __init__(
         self,
         backend: Backend,
-        sources: Sequence[tuple[Demonstration, Annotation]],
+        sources: Sequence[tuple[Demonstration, Annotation | None]],
         config: AugmentConfig,
     ) -> None:
         """Make attempts on `backend`, the robot in the demonstrations' scene."""
@@ -183,7 +183,7 @@ class RestoreExecutor(SegmentExecutor):
             outcome = str(error).partition(":")[0]
             return Attempt(key, outcome, None, str(error), self._seconds)
         provenance = Provenance(
-            demonstration_hash=self._sources[key.source][1].demonstration_hash,
+            demonstration_hash=planner.demonstration_hash,
             source=key.source,
             sphere=key.sphere,
             k=key.k,
@@ -193,6 +193,7 @@ class RestoreExecutor(SegmentExecutor):
             strategy=str(self._config.strategy),
             distribution=self._config.sampling.distribution,
             certificate=proof,
+            merged=proposal.merged,
         )
         steps = recorder.steps(backwards=True)
         return Attempt(key, KEPT, Episode(steps, provenance, joint_path), seconds=self._seconds)

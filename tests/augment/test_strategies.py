@@ -138,7 +138,8 @@ def test_the_sampled_pose_lies_on_the_sphere_turned_by_no_more_than_allowed(
     sphere = PrecisionSphere(0, pose(centre, turn), radius)
     config = SamplingConfig(distribution, nu)
     drawn = [
-        SART.propose(demonstration, sphere, np.random.default_rng(seed), config) for _ in range(2)
+        SART.propose(demonstration, [sphere], 0, np.random.default_rng(seed), config)
+        for _ in range(2)
     ]
     T = drawn[0].T_world_sampled
     np.testing.assert_array_equal(T, drawn[1].T_world_sampled)
@@ -155,7 +156,9 @@ def test_the_rotation_is_drawn_for_the_radius_of_the_sphere():
         angles = [
             angle_between(
                 np.eye(3),
-                SART.propose(demonstration, sphere, rng, SamplingConfig()).T_world_sampled[:3, :3],
+                SART.propose(demonstration, [sphere], 0, rng, SamplingConfig()).T_world_sampled[
+                    :3, :3
+                ],
             )
             for _ in range(3000)
         ]
@@ -177,7 +180,7 @@ def test_t_star_is_the_first_waypoint_after_the_key_outside_its_sphere(path, rad
         if np.linalg.norm(np.subtract(path[t], path[waypoint])) > radius:
             expected = t
     assert convergence_waypoint(demonstration, sphere) == expected
-    proposal = SART.propose(demonstration, sphere, np.random.default_rng(0), SamplingConfig())
+    proposal = SART.propose(demonstration, [sphere], 0, np.random.default_rng(0), SamplingConfig())
     assert proposal.t_star == expected
 
 
@@ -190,9 +193,12 @@ def test_a_demonstration_that_never_leaves_a_sphere_is_joined_at_its_last_waypoi
 def test_every_strategy_rejoins_ahead_of_its_sphere_and_follows_from_the_rng(
     strategy, peg_demonstration, peg_annotation
 ):
-    for sphere in peg_annotation.spheres:
+    spheres = peg_annotation.spheres
+    for i, sphere in enumerate(spheres):
         drawn = [
-            strategy.propose(peg_demonstration, sphere, np.random.default_rng(3), SamplingConfig())
+            strategy.propose(
+                peg_demonstration, spheres, i, np.random.default_rng(3), SamplingConfig()
+            )
             for _ in range(2)
         ]
         assert sphere.waypoint < drawn[0].t_star < len(peg_demonstration)
@@ -208,7 +214,7 @@ def _distances(region, distribution, n=3000):
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
     rng = np.random.default_rng(5)
     drawn = [
-        SART_PLANNED.propose(demonstration, region, rng, SamplingConfig(distribution))
+        SART_PLANNED.propose(demonstration, [region], 0, rng, SamplingConfig(distribution))
         for _ in range(n)
     ]
     offsets = np.array([d.T_world_sampled[:3, 3] for d in drawn]) - region.T_world_key[:3, 3]
@@ -235,7 +241,7 @@ def test_the_paper_s_strategy_draws_from_the_surface_of_a_sphere_of_either_kind(
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
     sphere = PrecisionSphere(0, pose([0.1, 0, 0]), 0.25, kind=kind)
     T = SART.propose(
-        demonstration, sphere, np.random.default_rng(1), SamplingConfig()
+        demonstration, [sphere], 0, np.random.default_rng(1), SamplingConfig()
     ).T_world_sampled
     assert np.linalg.norm(T[:3, 3] - [0.1, 0, 0]) == pytest.approx(0.25, abs=1e-12)
 
@@ -245,7 +251,7 @@ def test_in_a_ball_the_strategy_that_plans_draws_what_the_paper_s_does(distribut
     sphere, config = PrecisionSphere(0, pose([0.1, 0, 0]), 0.2), SamplingConfig(distribution)
     for seed in range(5):
         a, b = (
-            strategy.propose(demonstration, sphere, np.random.default_rng(seed), config)
+            strategy.propose(demonstration, [sphere], 0, np.random.default_rng(seed), config)
             for strategy in (SART, SART_PLANNED)
         )
         assert a.t_star == b.t_star
@@ -259,8 +265,8 @@ def test_only_the_planned_strategy_plans():
 class Still(Strategy):
     """A strategy from outside: stay at the key pose."""
 
-    def propose(self, demonstration, sphere, rng, config):
-        return Proposal(sphere.waypoint + 1, sphere.T_world_key)
+    def propose(self, demonstration, spheres, i, rng, config):
+        return Proposal(spheres[i].waypoint + 1, spheres[i].T_world_key)
 
 
 def test_a_strategy_of_one_s_own_is_taken_as_it_is_and_noted_by_its_reference():
