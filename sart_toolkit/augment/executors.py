@@ -176,12 +176,8 @@ class RestoreExecutor(SegmentExecutor):
             motion, certificate = planner.plan(proposal, rng, self.tracking_error)
             recorder, joint_path = self._execute(planner, motion, demonstration, t_star)
             proof = self._proof(planner, motion, certificate, joint_path, t_star)
-        except Unreachable as error:
-            return Attempt(key, "out of reach", None, str(error), self._seconds)
-        except MotionRejected as error:
-            # What stands behind the colon differs each time.
-            outcome = str(error).partition(":")[0]
-            return Attempt(key, outcome, None, str(error), self._seconds)
+        except (Unreachable, MotionRejected) as error:
+            return Attempt(key, rejected_outcome(error), None, str(error), self._seconds)
         provenance = Provenance(
             demonstration_hash=planner.demonstration_hash,
             source=key.source,
@@ -316,6 +312,12 @@ def get_executor(name: str) -> type[SegmentExecutor]:
         "executor", name, resolve("executor", name, EXECUTORS), SegmentExecutor
     )
     return found
+
+
+def rejected_outcome(error: Unreachable | MotionRejected) -> str:
+    """The outcome of an attempt that ended with an error: the same for all that fail alike."""
+    # What stands behind the colon differs each time.
+    return "out of reach" if isinstance(error, Unreachable) else str(error).partition(":")[0]
 
 
 def recorded_cameras(demonstration: Demonstration, config: AugmentConfig) -> tuple[str, ...]:

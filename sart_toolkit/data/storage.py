@@ -22,7 +22,7 @@ import stat
 import tempfile
 import typing
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -294,6 +294,23 @@ def append_json_line(path: Path, value: Mapping[str, Any]) -> None:
     with _cannot_write(Path(path)), open(path, "ab+") as file:
         _drop_cut_line(file)
         file.write(_to_line(value))
+
+
+def write_json_lines(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write JSON objects as lines, the first with a `schema_version`, whole or not at all.
+
+    Args:
+        path: the file.
+        rows: what the lines are to hold, one in memory at a time.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    head: Mapping[str, Any] = {"schema_version": SCHEMA_VERSION}
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        for row in rows:
+            file.write(_to_line({**head, **row}))
+            head = {}
 
 
 def _drop_cut_line(file: io.BufferedRandom) -> None:
