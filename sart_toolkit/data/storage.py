@@ -127,6 +127,25 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def link_file(source: Path, target: Path) -> None:
+    """Have a file by another name too, or where the disk can't do that, copied.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    remove(target)
+    with _cannot_write(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(os.path.realpath(source), target)
+            return
+        except OSError:
+            # Across disks, and where a file has as many names as it can have.
+            pass
+    with replacing(target) as temporary:
+        shutil.copyfile(source, temporary)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all.
 
@@ -482,21 +501,21 @@ class Journal:
             self._lock.close()
             raise
 
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Add one row.
+    def append(self, *rows: Mapping[str, Any]) -> None:
+        """Add rows, all of them or none.
 
         Raises:
             CannotWrite: the disk refuses.
             InvalidInput: a number is NaN or infinite, or a value isn't JSON.
         """
         try:
-            line = _to_line(row)
+            lines = b"".join(map(_to_line, rows))
         except (TypeError, ValueError) as error:
             raise InvalidInput(f"{self.path}: can't be written as JSON: {error}") from error
         with _cannot_write(self.path):
             end = self._file.seek(0, os.SEEK_END)
             try:
-                self._file.write(line)
+                self._file.write(lines)
                 self._file.flush()
                 os.fsync(self._file.fileno())
             except OSError:
@@ -504,7 +523,7 @@ class Journal:
                 with contextlib.suppress(OSError):
                     os.ftruncate(self._file.fileno(), end)
                 raise
-        self.rows.append(dict(row))
+        self.rows += map(dict, rows)
 
     def clear(self) -> None:
         """Drop all rows."""
@@ -689,13 +708,14 @@ def _header_of(path: Path, block: bytes) -> dict[str, Any]:
     return dict(about)
 
 
-def _check_bytes(path: Path, kind: str) -> str:
+def check_bytes(path: Path, kind: str) -> str:
     """The SHA-256 of a file of `kind`, which is what its first block says.
 
     Raises:
+        MissingFile: no such file.
         BrokenFile: it isn't; the file was changed since it was written.
     """
-    with open(path, "rb") as file:
+    with open(_existing(path), "rb") as file:
         block = file.read(_BLOCK)
         about = _header_of(path, block)
         if about.get("kind") != kind:
@@ -715,7 +735,7 @@ def _check_bytes(path: Path, kind: str) -> str:
 def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
     path = _existing(path)
     try:
-        sha256 = _check_bytes(path, kind)
+        sha256 = check_bytes(path, kind)
         if sha256 not in _inspected:
             inspect(path, kind)
             _inspected.add(sha256)
