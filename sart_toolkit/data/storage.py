@@ -783,13 +783,13 @@ def _put_steps(group: h5py.Group, steps: Steps) -> None:
     cameras = group.create_group("cameras")
     for name, camera in steps.cameras.items():
         at = cameras.create_group(name)
-        _put_frames(at, "rgb", camera.rgb)
-        _put_frames(at, "depth", camera.depth)
+        put_frames(at, "rgb", camera.rgb)
+        put_frames(at, "depth", camera.depth)
         at["intrinsics"] = camera.intrinsics
         at["T_frame_camera"] = camera.T_frame_camera
 
 
-def _put_frames(group: h5py.Group, name: str, frames: NDArray[Any]) -> None:
+def put_frames(group: h5py.Group, name: str, frames: NDArray[Any]) -> None:
     """Write images, each in a chunk of its own, so that a step can be read by itself.
 
     They are stored as HDF5's own filters shuffle and DEFLATE would, which every HDF5 library reads;
@@ -811,8 +811,8 @@ def _put_frames(group: h5py.Group, name: str, frames: NDArray[Any]) -> None:
         stored.id.write_direct_chunk((i, *(0 for _ in frame.shape)), packed)
 
 
-def _get_frames(stored: h5py.Dataset) -> NDArray[Any]:
-    """The images that `_put_frames` wrote.
+def get_frames(stored: h5py.Dataset) -> NDArray[Any]:
+    """The images that `put_frames` wrote.
 
     HDF5 itself would unpack whatever a chunk says; here one never takes more than its image.
 
@@ -836,7 +836,7 @@ def _get_steps(group: h5py.Group, frames: Mapping[str, CameraFrame]) -> Steps:
         name: CameraRecord(
             frame=frame,
             **{
-                part: _get_frames(stored) if part in ("rgb", "depth") else stored[()]
+                part: get_frames(stored) if part in ("rgb", "depth") else stored[()]
                 for part, stored in group["cameras"][name].items()
             },
         )

@@ -214,7 +214,7 @@ def test_validate_proves_a_dataset_again_and_names_what_does_not_hold(
     assert f"{episode.name}: " in said and "truncated" in said
     assert "1 of 4 episodes don't hold; generate them again" in said
     (broken / "dataset.json").unlink()
-    assert "generation was interrupted" in error(capsys, "validate", broken)
+    assert "interrupted while it was made" in error(capsys, "validate", broken)
 
 
 def test_radii_are_suggested_from_the_recorded_images_alone(
