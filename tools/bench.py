@@ -709,15 +709,16 @@ def _codec_figures(frames: NDArray[Any], repeats: int) -> dict[str, Any]:
     codecs["png"] = functools.partial(_through_png, frames, False)
     if frames.dtype == np.float32:
         codecs["png_16_bit"] = functools.partial(_through_png, frames, True)
-    found = {}
-    for name, codec in codecs.items():
-        rows = [codec() for _ in range(repeats)]
-        found[name] = {
-            "ratio": frames.nbytes / rows[0][0],
-            "write_us": 1e6 * statistics.median(row[1] for row in rows) / len(frames),
-            "read_us": 1e6 * statistics.median(row[2] for row in rows) / len(frames),
+    # In turn, so that whatever else the machine does slows all alike.
+    turns = [{name: codec() for name, codec in codecs.items()} for _ in range(repeats)]
+    return {
+        name: {
+            "ratio": frames.nbytes / turns[0][name][0],
+            "write_us": 1e6 * statistics.median(turn[name][1] for turn in turns) / len(frames),
+            "read_us": 1e6 * statistics.median(turn[name][2] for turn in turns) / len(frames),
         }
-    return found
+        for name in codecs
+    }
 
 
 def _put_plain(filters: dict[str, Any], file: h5py.File, name: str, frames: NDArray[Any]) -> None:

@@ -21,7 +21,6 @@ import shutil
 import stat
 import tempfile
 import typing
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -55,6 +54,8 @@ from sart_toolkit.errors import (
 )
 
 SCHEMA_VERSION = 6
+# Its type information has it as an exception, not as a class of these.
+_IsalError: type[Exception] = isal_zlib.error  # type: ignore[assignment]
 
 # The largest files that are read as JSON, and as lines of JSON.
 MAX_JSON_BYTES = 16 * 2**20
@@ -332,7 +333,7 @@ def write_json_lines(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
             head = {}
 
 
-def _drop_cut_line(file: io.BufferedRandom) -> None:
+def _drop_cut_line(file: io.BufferedRandom | io.FileIO) -> None:
     """Cut off what a crash left of a last line."""
     end = file.seek(0, os.SEEK_END)
     file.seek(max(0, end - 1))
@@ -490,7 +491,8 @@ class Journal:
         try:
             with _cannot_write(self.path):
                 linked(path).parent.mkdir(parents=True, exist_ok=True)
-                self._file = open(self.path, "ab+")  # noqa: SIM115 - open until `close`
+                # What a full disk refuses must not stay in a buffer and be written later.
+                self._file = open(self.path, "ab+", buffering=0)  # noqa: SIM115 - until `close`
                 _drop_cut_line(self._file)
             try:
                 self.rows = read_json_lines(self.path) if read else []
@@ -515,8 +517,9 @@ class Journal:
         with _cannot_write(self.path):
             end = self._file.seek(0, os.SEEK_END)
             try:
-                self._file.write(lines)
-                self._file.flush()
+                left = memoryview(lines)
+                while left:
+                    left = left[self._file.write(left) :]
                 os.fsync(self._file.fileno())
             except OSError:
                 # What the disk has no room for must not stand before the next row.
@@ -748,7 +751,7 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
     # A damaged file may hold anything in place of a group, a number or JSON.
     except (
         OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError,
-        OverflowError, lzma.LZMAError, zlib.error
+        OverflowError, lzma.LZMAError, _IsalError
     ) as error:  # fmt: skip
         raise BrokenFile(
             f"{path}: truncated or not a {kind} file ({error}); restore a copy or make it again"
@@ -822,12 +825,15 @@ def get_frames(stored: h5py.Dataset) -> NDArray[Any]:
     frames = np.empty(stored.shape, stored.dtype)
     for i, frame in enumerate(frames):
         _, packed = stored.id.read_direct_chunk((i, *(0 for _ in frame.shape)))
-        unpacker = zlib.decompressobj()
+        unpacker = isal_zlib.decompressobj()
         shuffled = unpacker.decompress(packed, frame.nbytes + 1)
         if len(shuffled) != frame.nbytes or not unpacker.eof:
             raise ValueError(f"{stored.name}: image {i} unpacks to another size")
-        rows = np.frombuffer(shuffled, np.uint8).reshape(frames.itemsize, -1)
-        frame[...] = np.ascontiguousarray(rows.T).view(frames.dtype).reshape(frame.shape)
+        # All first bytes of the numbers go to their places, then all second ones, and so on.
+        numbers = frame.reshape(-1).view(np.uint8).reshape(-1, frames.itemsize)
+        rows = np.frombuffer(shuffled, np.uint8).reshape(numbers.shape[::-1])
+        for byte, row in enumerate(rows):
+            numbers[:, byte] = row
     return frames
 
 
