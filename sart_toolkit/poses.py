@@ -6,6 +6,7 @@ vectors are axis times angle [rad]. Quaternions never appear here.
 
 from __future__ import annotations
 
+import math
 import numbers
 from typing import Any
 
@@ -51,7 +52,29 @@ def check_pose(name: str, value: ArrayLike) -> Array:
     Raises:
         InvalidInput: wrong shape, not finite, or not a rigid transform.
     """
-    return check_poses(name, _as_array(name, value)[None])[0]
+    array = _as_array(name, value)
+    # By plain numbers a tenth of the time: solvers check a pose at every step.
+    if array.shape == (4, 4) and array.dtype == np.float64 and _surely_rigid(array.tolist()):
+        return np.array(array)
+    return check_poses(name, array[None])[0]
+
+
+def _surely_rigid(rows: list[list[float]]) -> bool:
+    """Whether `check_poses` takes a matrix of these rows, which need not be asked then."""
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = rows
+    # Half of what is allowed leaves room for rounding; what is no number fails every comparison.
+    most = _ORTHONORMAL_TOLERANCE / 2
+    return (
+        abs(a * a + b * b + c * c - 1) < most
+        and abs(d * d + e * e + f * f - 1) < most
+        and abs(g * g + h * h + i * i - 1) < most
+        and abs(a * d + b * e + c * f) < most
+        and abs(a * g + b * h + c * i) < most
+        and abs(d * g + e * h + f * i) < most
+        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
+        and last == [0.0, 0.0, 0.0, 1.0]
+        and math.isfinite(x + y + z)
+    )
 
 
 def check_poses(name: str, value: ArrayLike) -> Array:
