@@ -51,6 +51,7 @@ from sart_toolkit.registry import check_known, reference_to
 from sart_toolkit.robots import ROBOTS, get_robot
 from sart_toolkit.robots.spec import check_image_size
 from sart_toolkit.tasks import TASKS, get_task
+from sart_toolkit.workers import Workers
 
 if TYPE_CHECKING:
     from sart_toolkit.augment.config import AugmentConfig
@@ -425,7 +426,7 @@ def augment(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     backend: BackendLike | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Progress = _silent,
     sensor: SensorErrors | None = None,
@@ -438,7 +439,7 @@ def augment(
         annotation: its precision spheres.
         out: directory to write; an interrupted generation resumes.
         task, robot, backend: in place of those that the demonstration notes.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: whether `out` may be replaced.
         progress: called with the trajectories kept.
         sensor: with `obstacles` "cloud", what the images may be off by; if left out, what the
@@ -598,7 +599,7 @@ def evaluate(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     backend: BackendLike | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     device: str = "cpu",
     overwrite: bool = False,
     progress: Progress = _silent,
@@ -610,7 +611,7 @@ def evaluate(
         skill: the skill.
         out: JSON file to write; videos go beside it. An interrupted evaluation resumes.
         task, robot, backend: in place of those that the skill notes.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         device: where the policy runs.
         overwrite: whether `out` may be replaced.
         progress: called with the rollouts done.
@@ -690,7 +691,7 @@ def run(
     image_size: ImageSize = 128,
     seed: int = 0,
     eval_seed: int = 1000,
-    workers: int = 1,
+    workers: int | Workers = 1,
     device: str = "auto",
     overwrite: bool = False,
     command: str = "sart_toolkit.run",
@@ -716,7 +717,7 @@ def run(
         image_size: width and height of recorded images [pixels]; one number for a square.
         seed: of all that is random, except evaluation.
         eval_seed: of the placements that are evaluated.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         device: where training and the policy run: "auto", "cpu" or "cuda".
         overwrite: whether a run in `out` may be replaced.
         command: how it was asked for, kept with the run.

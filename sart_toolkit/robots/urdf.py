@@ -159,6 +159,17 @@ def _mesh_names(source: Path, digest: str) -> tuple[str, ...]:
     return tuple(sorted({mesh.get("filename", "") for mesh in parsed(source).iter("mesh")}))
 
 
+def source_files(source: Path) -> list[Path]:
+    """A URDF and the existing mesh files that it names.
+
+    Raises:
+        BrokenFile: the URDF can't be read.
+    """
+    names = _mesh_names(source, _digest(source))
+    meshes = [_mesh_path(name, source.parent) for name in names]
+    return [source, *(path for path in meshes if path.is_file())]
+
+
 def _intact(directory: Path) -> bool:
     """Whether a folder holds the files that were put there, with the same content."""
     try:
