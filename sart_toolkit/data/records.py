@@ -33,6 +33,7 @@ DepthImage = NDArray[np.float32]
 ACTION_SIZE = 7
 CameraFrame = Literal["tool", "world"]
 Judge = Literal["task", "person", "nobody"]
+Recording = Literal["reversed", "return"]
 # nu_r [rad/m]: rotation drawn per metre of radius, the published code's value.
 ROTATION_PER_METRE = 2.0
 
@@ -503,7 +504,8 @@ class Provenance:
     """Where a generated episode comes from: enough to generate it again.
 
     `source` is the number of its demonstration in the dataset, `sphere` that of its sphere in that
-    demonstration's annotation, `k` that of the attempt from the sphere.
+    demonstration's annotation, `k` that of the attempt from the sphere. `recording`: whether the
+    segment's steps were recorded on the way out and reversed, or on the return.
     """
 
     demonstration_hash: str
@@ -516,6 +518,7 @@ class Provenance:
     strategy: str
     distribution: str
     certificate: Mapping[str, Any] | None = None
+    recording: Recording = "reversed"
 
     def __post_init__(self) -> None:
         sampled = check_pose("T_world_sampled", self.T_world_sampled)
@@ -524,11 +527,12 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Episode:
-    """One generated trajectory: the reversed segment's steps, then the demonstration from `t_star`.
+    """One generated trajectory: the segment's steps to t*, then the demonstration from `t_star`.
 
     The segment's last step is followed by the demonstration's step `provenance.t_star`; that
     suffix is stored once, in the demonstration. `joint_path (m, n)` [rad]: the joints as they were
-    measured while the segment was executed, from t* outwards, at the backend's own rate.
+    measured while the segment was executed, from t* outwards, and back again where the return was
+    recorded, at the backend's own rate.
     """
 
     steps: Steps
