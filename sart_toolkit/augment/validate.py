@@ -62,8 +62,9 @@ def validate_dataset(
     For each episode: the file's content hash; that seed, sphere and k lead to its sampled pose; the
     certificates of the joint path commanded and of the one measured; that what it commands is that
     path backwards, and what it measured the measured path, backwards where it was reversed; that
-    every commanded pose followed by its action gives the next one, also across the join. For the dataset: that it holds
-    the demonstrations and the episodes that it lists. One episode is in memory at a time.
+    every commanded pose followed by its action gives the next one, also across the join. For the
+    dataset: that it holds the demonstrations and the episodes that it lists. One episode is in
+    memory at a time.
 
     Args:
         path: directory from `sart augment`.
