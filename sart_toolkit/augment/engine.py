@@ -51,7 +51,9 @@ class _Worker:
         self._files = files
         self._backend = make_backend()
         pairs = [(source.demonstration, source.annotation) for source in sources]
-        self._executor = get_executor(config.executor)(self._backend, pairs, config)
+        demonstrations = [source.demonstration for source in sources]
+        executor = get_executor(config.execution, self._backend, demonstrations)
+        self._executor = executor(self._backend, pairs, config)
 
     def results(self, keys: Iterable[AttemptKey]) -> Iterator[_Result]:
         """The results of attempts, one after the other, in the executor's order."""
@@ -125,11 +127,8 @@ def augment_sources(
     config = config or AugmentConfig()
     # All that can be refused is refused before anything is replaced.
     check_sources(sources)
-    executor = get_executor(config.executor)
     if workers < 1:
         raise InvalidInput(f"workers: expected at least 1, got {workers}")
-    if workers > 1 and not executor.parallel:
-        raise InvalidInput(f"workers: executor {config.executor!r} needs 1 process, got {workers}")
     strategy = get_strategy(config.strategy)
     drawn = [
         (source, i, sphere)
@@ -142,9 +141,15 @@ def augment_sources(
         SphereShare(source, i, sphere.waypoint, share)
         for (source, i, sphere), share in zip(drawn, allocate(wanted, weights), strict=True)
     ]
+    demonstrations = [demonstration for demonstration, _ in sources]
     with closing(make_backend()) as backend:
+        executor = get_executor(config.execution, backend, demonstrations)
+        if workers > 1 and not executor.parallel:
+            raise InvalidInput(
+                f"workers: executor {config.execution!r} needs 1 process, got {workers}"
+            )
         if drawn:
-            executor.check(backend, [demonstration for demonstration, _ in sources], config)
+            executor.check(backend, demonstrations, config)
         request = _request(backend, config)
     started = time.perf_counter()
     with DatasetWriter(out, sources, request, overwrite) as writer:

@@ -389,6 +389,13 @@ class Augment:
             "where the joints need it."
         ),
     ] = 2.0
+    recording: Annotated[
+        Literal["reversed", "return"],
+        arg(
+            help="Which way is recorded: out, reversed as in the paper, or the return, on which "
+            "the robot lags behind its commands as it does when a policy acts."
+        ),
+    ] = "reversed"
     source: _SOURCE = "scene"
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
@@ -409,7 +416,7 @@ class Augment:
 
 @dataclass(frozen=True)
 class Validate:
-    """Prove commanded and measured paths of a dataset clear again; check hashes and reversals.
+    """Prove commanded and measured paths of a dataset clear again; check hashes and courses.
 
     Example: sart validate dataset
     """

@@ -38,6 +38,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
             strategy=args.strategy,
             sampling=SamplingConfig(args.distribution, args.rotation_per_metre),
             duration=args.duration,
+            recording=args.recording,
             margin=args.margin,
             slip_tolerance=args.slip_tolerance,
             obstacles=args.source,

@@ -894,15 +894,15 @@ class Backwards(RestoreExecutor):
 def test_an_executor_may_choose_its_order_and_changes_nothing_by_it(
     augment, crowded, crowded_dataset, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(engine, "get_executor", lambda name: Backwards)
-    with pytest.raises(InvalidInput, match="workers: executor 'restore' needs 1 process, got 2"):
+    monkeypatch.setattr(engine, "get_executor", lambda *_: Backwards)
+    with pytest.raises(InvalidInput, match="workers: executor 'auto' needs 1 process, got 2"):
         augment(crowded, tmp_path / "d", workers=2)
     assert augment(crowded, tmp_path / "d").content_hash == crowded_dataset.content_hash
 
 
 def test_an_unknown_executor_is_refused_with_the_nearest_name(annotate, augment, tmp_path):
     with pytest.raises(UnknownName, match="executor 'restroe': did you mean 'restore'"):
-        augment(annotate((0, 0.05)), tmp_path / "d", AugmentConfig(executor="restroe"))
+        augment(annotate((0, 0.05)), tmp_path / "d", AugmentConfig(execution="restroe"))
     assert not (tmp_path / "d").exists()
 
 
