@@ -8,10 +8,26 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from sart_toolkit.errors import InvalidInput
+
 
 def _optional(metavar: str, help: str) -> Any:
     """A flag that may be left out, what happens then being in its help."""
     return arg(metavar=metavar, help=help, help_behavior_hint="")
+
+
+def whole_numbers(flag: str, text: str) -> tuple[int, ...]:
+    """The numbers in a flag's comma-separated list.
+
+    Raises:
+        InvalidInput: something else is in it.
+    """
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError as error:
+        raise InvalidInput(
+            f"--{flag}: expected whole numbers separated by commas, got {text!r}"
+        ) from error
 
 
 _JSON = Annotated[bool, arg(name="json", help="Print the result as one JSON object on stdout.")]
@@ -35,7 +51,20 @@ _NOTED_BACKEND = Annotated[
     str | None, _optional("REF", f"Backend, as {_REF}; what the recording notes if left out.")
 ]
 _EPOCHS = Annotated[int | None, _optional("INT", "Training epochs; the policy's own if left out.")]
-_WORKERS = Annotated[int, arg(help="Processes to use.")]
+_WORKERS = Annotated[int, arg(help="Processes to use, or workers on the cluster.")]
+_EXECUTOR = Annotated[
+    Literal["processes", "ray"],
+    arg(help="What runs the workers: processes of this machine, or the nodes of a Ray cluster."),
+]
+_RAY_ADDRESS = Annotated[
+    str | None,
+    _optional(
+        "ADDRESS",
+        "With --executor ray: HOST:PORT of the cluster, auto for the one that this machine belongs "
+        "to, or local for one of this command's own; if left out RAY_ADDRESS, else auto, else "
+        "local.",
+    ),
+]
 _SEED = Annotated[int, arg(help="Seed of everything random in this step.")]
 _IMAGE = Annotated[
     str, arg(help="Size of recorded images [pixels]: 128, or width and height as in 160x120.")
@@ -48,15 +77,26 @@ _STRATEGY = Annotated[
     str,
     arg(
         metavar="REF",
-        help="sart: straight lines; sart_planned: round obstacles where these are blocked; or "
-        "your own.",
+        help="sart: straight lines; sart_planned: round obstacles where these are blocked; an "
+        "ablation or baseline of docs/strategies.md, such as miles or bc; or your own.",
     ),
 ]
 _POLICY = Annotated[
-    str,
-    arg(metavar="REF", help="Policy: compact_mlp, resnet18_mlp as in the paper, or your own."),
+    str | None,
+    _optional(
+        "REF",
+        "Policy: compact_mlp, resnet18_mlp as in the paper, replay, or your own; what the strategy "
+        "is for if left out (compact_mlp, or replay).",
+    ),
 ]
-_N = Annotated[int, arg(help="Trajectories in all, the demonstration among them.")]
+_N = Annotated[
+    int | None,
+    _optional(
+        "INT",
+        "Trajectories in all, the demonstrations among them; 40 if left out, or what the strategy "
+        "needs.",
+    ),
+]
 _EPISODES = Annotated[int, arg(help="Rollouts with random placements.")]
 _EVAL_SEED = Annotated[int, arg(help="Seed of the placements, separate from training's.")]
 _YAW = Annotated[
@@ -118,6 +158,10 @@ class Run:
 
     Example: sart run drawer.py:Drawer --robot my_panda:PANDA --out runs/drawer
 
+    Example: sart run peg_in_hole --out runs/bc --strategy bc
+
+    Example: sart run peg_in_hole --out runs/three --demonstrations 3
+
     An interrupted run resumes when the same command is typed again.
     """
 
@@ -126,8 +170,16 @@ class Run:
     backend: _BACKEND = "pybullet"
     robot: _ROBOT = None
     strategy: _STRATEGY = "sart"
-    policy: _POLICY = "compact_mlp"
-    n: _N = 40
+    policy: _POLICY = None
+    n: _N = None
+    demonstrations: Annotated[
+        int | None,
+        _optional(
+            "INT",
+            "Demonstrations to record, at random placements if more than one; 1 if left out, or "
+            "all N with bc.",
+        ),
+    ] = None
     episodes: _EPISODES = 50
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000
@@ -136,6 +188,8 @@ class Run:
     distribution: _DISTRIBUTION = "paper"
     epochs: _EPOCHS = None
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     device: _DEVICE = "auto"
     overwrite: _OVERWRITE = False
     json: _JSON = False
@@ -152,10 +206,20 @@ class Record:
     Example: sart record toolbox_picking --out demo.h5 --backend sapien
 
     Example: sart record peg_in_hole --out demo.h5 --seed 3 --placement random --yaw-deg 10
+
+    Example: sart record peg_in_hole --out demos --count 40 --placement random
     """
 
     task: _TASK
-    out: Annotated[Path, arg(help="HDF5 file to write.")]
+    out: Annotated[Path, arg(help="HDF5 file to write; with --count, the directory of as many.")]
+    count: Annotated[
+        int | None,
+        _optional(
+            "INT",
+            "Record several, in directory OUT, each with a seed of its own; those that are there "
+            "are kept.",
+        ),
+    ] = None
     device: Annotated[
         str,
         arg(
@@ -317,17 +381,26 @@ class Augment:
 
     Example: sart augment demo.h5 annotation.json --out dataset --source cloud
 
-    With --source cloud, images are read as the annotation says, where its spheres were suggested
-    from them; flags about the sensor replace that. An interrupted generation resumes when the same
+    Example: sart augment demos/*.h5 annotations/*.json --out dataset --n 100
+
+    Example: sart augment demos/*.h5 --out dataset --strategy bc
+
+    Each annotation finds its demonstration; trajectories are allocated to the spheres of all. With
+    --source cloud, images are read as the annotation says, where its spheres were suggested from
+    them; flags about the sensor replace that. An interrupted generation resumes when the same
     command is typed again.
     """
 
-    demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
-    annotation: Annotated[
-        Positional[Path], arg(metavar="ANNOTATION", help="Spheres from `sart suggest`.")
+    files: Annotated[
+        Positional[tuple[Path, ...]],
+        arg(
+            metavar="FILE [FILE ...]",
+            help="Demonstrations of one task (.h5), and the spheres of each (.json), in any order.",
+            help_behavior_hint="",
+        ),
     ]
     out: Annotated[Path, arg(help="Directory to write.")]
-    n: _N = 40
+    n: _N = None
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
     backend: _NOTED_BACKEND = None
@@ -347,6 +420,13 @@ class Augment:
             "where the joints need it."
         ),
     ] = 2.0
+    recording: Annotated[
+        Literal["reversed", "return"],
+        arg(
+            help="Which way is recorded: out, reversed as in the paper, or the return, on which "
+            "the robot lags behind its commands as it does when a policy acts."
+        ),
+    ] = "reversed"
     source: _SOURCE = "scene"
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
@@ -361,13 +441,15 @@ class Augment:
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     seed: _SEED = 0
     workers: _WORKERS = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
 
 @dataclass(frozen=True)
 class Validate:
-    """Prove commanded and measured paths of a dataset clear again; check hashes and reversals.
+    """Prove commanded and measured paths of a dataset clear again; check hashes and courses.
 
     Example: sart validate dataset
     """
@@ -390,13 +472,17 @@ class Train:
         --schedule cosine --image-size 64
 
     Example: sart train dataset --out skill --cameras wrist,overview
+
+    Example: sart train dataset --out skills --seeds 0,1,2 --workers 3
+
+    With --seeds there is a skill for each, OUT/seed0 and so on, and a table in OUT/sweep.json.
     """
 
     dataset: Annotated[
         Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment`.")
     ]
-    out: Annotated[Path, arg(help="Skill directory to write.")]
-    policy: _POLICY = "compact_mlp"
+    out: Annotated[Path, arg(help="Directory to write: the skill, or with --seeds one for each.")]
+    policy: _POLICY = None
     epochs: _EPOCHS = None
     lr: Annotated[
         float | None, _optional("FLOAT", "Learning rate; the policy's own if left out.")
@@ -431,8 +517,22 @@ class Train:
             "File with ResNet18 weights (torchvision's names) to start from; none if left out.",
         ),
     ] = None
-    seed: _SEED = 0
+    seed: Annotated[
+        int | None, _optional("INT", "Seed of everything random in this step; 0 if left out.")
+    ] = None
+    seeds: Annotated[
+        str | None,
+        _optional(
+            "INT,INT...",
+            "Comma-separated seeds, to train a skill with each; one skill if left out.",
+        ),
+    ] = None
     device: _DEVICE = "auto"
+    workers: Annotated[
+        int, arg(help="Processes to use, or workers on the cluster, with --seeds.")
+    ] = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -459,6 +559,8 @@ class Evaluate:
     vary_appearance: _APPEARANCE = False
     videos: Annotated[int, arg(help="Videos of the first successes, and as many of failures.")] = 2
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     device: _DEVICE = "cpu"
     overwrite: _OVERWRITE = False
     json: _JSON = False
@@ -483,6 +585,8 @@ class BenchmarkOperator:
     yaw_deg: _YAW = 0.0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_operator.json")
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -532,6 +636,8 @@ class BenchmarkSegments:
     ] = "0"
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_segments.json")
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -555,6 +661,8 @@ class BenchmarkRadii:
     seed: _SEED = 0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_radii.json")
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -578,7 +686,11 @@ class BenchmarkCloud:
     backends: _BACKENDS = "pybullet"
     seed: _SEED = 0
     noise: Annotated[int, arg(help="Noise draws for each task and sensor; 0: images as drawn.")] = 0
-    workers: Annotated[int, arg(help="Processes to use, with --noise.")] = 1
+    workers: Annotated[
+        int, arg(help="Processes to use, or workers on the cluster, with --noise.")
+    ] = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_cloud.json")
     overwrite: _OVERWRITE = False
     json: _JSON = False
@@ -600,13 +712,15 @@ class BenchmarkSkill:
     out: Annotated[Path, arg(help="Directory to write.")]
     tasks: _TASKS = "all"
     backends: _BACKENDS = "all"
-    policy: _POLICY = "compact_mlp"
-    n: _N = 40
+    policy: _POLICY = None
+    n: _N = None
     epochs: _EPOCHS = None
     episodes: _EPISODES = 20
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     device: _DEVICE = "auto"
     json: _JSON = False
 

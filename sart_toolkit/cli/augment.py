@@ -10,30 +10,36 @@ from sart_toolkit.cli.arguments import Augment, Validate
 from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
+from sart_toolkit.cli.workers import chosen_workers
 from sart_toolkit.data.sampling import SamplingConfig
-from sart_toolkit.errors import Mismatch
+from sart_toolkit.errors import InvalidInput, Mismatch
 
 
 def augment_verb(args: Augment) -> dict[str, Any]:
     """`sart augment`."""
     sensor = declared_sensor(args)
+    annotations = [path for path in args.files if path.suffix == ".json"]
+    demos = [path for path in args.files if path not in annotations]
+    if not demos:
+        raise InvalidInput("FILE: expected a demonstration, got annotations alone; add its .h5")
     with ProgressDisplay() as progress:
         dataset = pipeline.augment(
-            args.demo,
-            args.annotation,
+            demos,
+            annotations,
             args.out,
             task=args.task,
             robot=args.robot,
             backend=args.backend,
-            workers=args.workers,
+            workers=chosen_workers(args),
             overwrite=args.overwrite,
             progress=progress,
             sensor=sensor,
-            n=args.n,
+            **({} if args.n is None else {"n": args.n}),
             allocation=args.allocation,
             strategy=args.strategy,
             sampling=SamplingConfig(args.distribution, args.rotation_per_metre),
             duration=args.duration,
+            recording=args.recording,
             margin=args.margin,
             slip_tolerance=args.slip_tolerance,
             obstacles=args.source,

@@ -7,6 +7,7 @@ from typing import Any
 from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Report, Run
 from sart_toolkit.cli.console import ProgressDisplay, typed
+from sart_toolkit.cli.workers import chosen_workers
 
 
 def run_verb(args: Run) -> dict[str, Any]:
@@ -20,6 +21,7 @@ def run_verb(args: Run) -> dict[str, Any]:
             strategy=args.strategy,
             policy=args.policy,
             n=args.n,
+            demonstrations=args.demonstrations,
             episodes=args.episodes,
             epochs=args.epochs,
             distribution=args.distribution,
@@ -27,7 +29,7 @@ def run_verb(args: Run) -> dict[str, Any]:
             image_size=args.image_size,
             seed=args.seed,
             eval_seed=args.eval_seed,
-            workers=args.workers,
+            workers=chosen_workers(args),
             device=args.device,
             overwrite=args.overwrite,
             command=typed(),

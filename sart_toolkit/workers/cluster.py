@@ -46,8 +46,10 @@ def ray_map(
         Mismatch: a node has another version of the toolkit or of what results depend on.
         SartError: there is no such cluster, or an item's worker was lost again and again.
     """
-    # Before Ray is imported, which reads it.
+    # Before Ray is imported, which reads them: it reports to nobody, and prints nothing on stdout,
+    # where it would say at length that a node is lost.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")
     import ray
 
     with _connected(ray, count, address):
