@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import concurrent.futures
 import logging
 import os
 import pickle
@@ -15,7 +16,7 @@ import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from sart_toolkit.data.records import library_versions
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError
@@ -119,6 +120,9 @@ def _handlers_kept() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+_Answer: TypeAlias = "concurrent.futures.Future[Any]"
+
+
 class _Member(NamedTuple):
     """A worker on the cluster, and the node that it is on."""
 
@@ -150,17 +154,17 @@ class _Team:
         self._outputs = work.outputs
         # In a list Ray hands them on unread: a node without the toolkit could not read them.
         self._parcels = [ray.put(pack(Home(), ray.put)), ray.put(work)]
-        self._versions = actor.versions([*library_versions(), *_CONTENT])
-        self._starting: dict[Any, Any] = {}
+        self._versions = versions_here(actor)
+        self._starting: dict[_Answer, Any] = {}
         self._idle: list[_Member] = []
-        self._busy: dict[Any, tuple[_Member, int]] = {}
+        self._busy: dict[_Answer, tuple[_Member, int]] = {}
         self._failed_starts = 0
         for _ in range(count):
             self._start()
 
     def _start(self) -> None:
         actor = self._actor.remote()
-        self._starting[actor.start.remote(self._versions, self._parcels)] = actor
+        self._starting[actor.start.remote(self._versions, self._parcels).future()] = actor
 
     def map(self, items: Iterable[Any]) -> Iterator[Any]:
         """The results of items in order; whoever is free takes the next one."""
@@ -172,14 +176,14 @@ class _Team:
             while i not in done:
                 while waiting and self._idle:
                     member, n = self._idle.pop(), waiting.popleft()
-                    self._busy[member.actor.work.remote(pack(wanted[n]))] = member, n
-                ref = self._next_ready()
-                if ref in self._starting:
-                    self._started(ref)
+                    self._busy[member.actor.work.remote(pack(wanted[n])).future()] = member, n
+                answer = self._next_answer()
+                if answer in self._starting:
+                    self._started(answer)
                     continue
-                member, n = self._busy.pop(ref)
+                member, n = self._busy.pop(answer)
                 try:
-                    done[n] = self._ray.get(ref)
+                    done[n] = answer.result()
                     self._idle.append(member)
                 except self._ray.exceptions.RayError as error:
                     losses[n] += 1
@@ -193,23 +197,24 @@ class _Team:
                     waiting.appendleft(n)
             yield done.pop(i).value(self._outputs)
 
-    def _next_ready(self) -> Any:
-        """What a worker, the first of all, has an answer to."""
+    def _next_answer(self) -> _Answer:
+        """The first answer that a worker has given."""
         asked = [*self._busy, *self._starting]
         timeout = None if self._busy else _START_SECONDS
-        ready, _ = self._ray.wait(asked, num_returns=1, timeout=timeout)
-        if not ready:
+        # Ray's own ways to wait make a KeyboardInterrupt of whatever a signal's handler raises.
+        answered = concurrent.futures.wait(asked, timeout, concurrent.futures.FIRST_COMPLETED).done
+        if not answered:
             free = self._ray.available_resources().get("CPU", 0)
             raise SartError(
                 f"no worker has started within {_START_SECONDS:.0f} s, of the cluster's CPUs "
                 f"{free:.0f} are free; see `ray status`"
             )
-        return ready[0]
+        return answered.pop()
 
-    def _started(self, ref: Any) -> None:
-        actor = self._starting.pop(ref)
+    def _started(self, answer: _Answer) -> None:
+        actor = self._starting.pop(answer)
         try:
-            node, differing, outcome = self._ray.get(ref)
+            node, differing, outcome = answer.result()
         except self._ray.exceptions.RayError as error:
             self._failed_starts += 1
             if self._failed_starts == _MOST_LOSSES:
@@ -263,6 +268,12 @@ def _short(item: Any) -> str:
 
 # Besides the versions of packages: what is in the toolkit, of which a checkout has no version.
 _CONTENT = ("sart_toolkit's code", "sart_toolkit's assets")
+
+
+def versions_here(actor: type[Any]) -> dict[str, str]:
+    """What this machine has of all that results depend on, as actors of the class would find it."""
+    found: dict[str, str] = actor.versions([*library_versions(), *_CONTENT])
+    return found
 
 
 def _actor_class() -> type[Any]:

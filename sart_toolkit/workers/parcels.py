@@ -127,7 +127,8 @@ class _Packer(pickle.Pickler):
         if whole.is_relative_to(assets_folder()):
             return "asset", str(whole.relative_to(assets_folder()))
         name = original_path(whole)
-        if self._only is not None and not _within(name, self._only):
+        sent = self._only is None or _within(name, self._only)
+        if not sent or not whole.exists():
             return "elsewhere", str(path)
         if whole.is_dir():
             if Path.cwd().is_relative_to(whole):
