@@ -28,6 +28,7 @@ from sart_toolkit.data.records import (
     Annotation,
     Demonstration,
     Rates,
+    Recording,
     Referring,
     library_versions,
 )
@@ -816,6 +817,7 @@ def run(
     episodes: int = 50,
     epochs: int | None = None,
     distribution: Literal["paper", "area"] = "paper",
+    recording: Recording = "reversed",
     cameras: Sequence[str] = ("wrist",),
     image_size: ImageSize = 128,
     seed: int = 0,
@@ -845,6 +847,7 @@ def run(
         episodes: rollouts with random placements.
         epochs: of training, the policy's own if None.
         distribution: how positions are drawn on a sphere.
+        recording: whether segments are recorded on the way out and reversed, or on the return.
         cameras: whose images are recorded and trained on.
         image_size: width and height of recorded images [pixels]; one number for a square.
         seed: of all that is random, except evaluation.
@@ -882,6 +885,7 @@ def run(
     get_backend(backend)
     generation: dict[str, Any] = {
         "n": n, "strategy": strategy, "sampling": SamplingConfig(distribution), "seed": seed,
+        "recording": recording,
     }  # fmt: skip
     drawn = AugmentConfig(**generation)
     training: dict[str, Any] = {
@@ -904,6 +908,7 @@ def run(
         "cameras": list(cameras),
         "image_size": list(size),
         "distribution": distribution,
+        "recording": recording,
         "epochs": epochs,
         "device": device,
     }

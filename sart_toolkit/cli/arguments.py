@@ -60,6 +60,13 @@ _POLICY = Annotated[
         "is for if left out (compact_mlp, or replay).",
     ),
 ]
+_RECORDING = Annotated[
+    Literal["reversed", "return"],
+    arg(
+        help="Which way is recorded: out, reversed as in the paper, or the return, on which "
+        "the robot lags behind its commands as it does when a policy acts."
+    ),
+]
 _N = Annotated[
     int | None,
     _optional(
@@ -157,6 +164,7 @@ class Run:
     cameras: _CAMERAS = "wrist"
     image_size: _IMAGE = "128"
     distribution: _DISTRIBUTION = "paper"
+    recording: _RECORDING = "reversed"
     epochs: _EPOCHS = None
     workers: _WORKERS = 2
     device: _DEVICE = "auto"
@@ -389,13 +397,7 @@ class Augment:
             "where the joints need it."
         ),
     ] = 2.0
-    recording: Annotated[
-        Literal["reversed", "return"],
-        arg(
-            help="Which way is recorded: out, reversed as in the paper, or the return, on which "
-            "the robot lags behind its commands as it does when a policy acts."
-        ),
-    ] = "reversed"
+    recording: _RECORDING = "reversed"
     source: _SOURCE = "scene"
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
