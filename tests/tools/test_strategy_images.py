@@ -35,7 +35,7 @@ def test_an_image_shows_what_its_strategy_draws(tmp_path):
     assert set(images) == {"sart", "no_merge"}
     # Yellow is what follows: nothing where nothing is merged.
     yellow = {
-        name: ((i[..., 0] > 200) & (i[..., 1] > 150) & (i[..., 2] < 110)).sum()
+        name: ((i[..., 0] > 200) & (i[..., 1] > 160) & (i[..., 2] < 70)).sum()
         for name, i in images.items()
     }
     assert yellow["sart"] > 500 and yellow["no_merge"] == 0
