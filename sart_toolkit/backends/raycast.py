@@ -42,7 +42,7 @@ class RayCaster:
     """Rigid bodies and a light, of which it takes images wherever bodies and camera are.
 
     A point shows its colour times ambient + intensity * cos(angle to the light), and only the
-    ambient part in the shadow of a body.
+    ambient part on far sides and, where the light has shadows, in the shadow of a body.
     """
 
     def __init__(self, bodies: Mapping[str, Sequence[DrawnMesh]], light: Light) -> None:
@@ -107,8 +107,11 @@ class RayCaster:
             if self._names[i] not in carried:
                 image.add(i, self._bodies[i], Ts[i], corners[i])
         to_light = T_camera_world[:3, :3] @ self._light.direction
-        lit = image.lit(self._bodies, Ts, corners, to_light)
-        return image.shown(lit, self._palette, self._light, T_world_camera)
+        facing = image.facing(to_light)
+        if self._light.shadows:
+            lit = np.flatnonzero(facing > 0)
+            facing[lit[image.hidden(lit, self._bodies, Ts, corners, to_light)]] = 0.0
+        return image.shown(facing, self._palette, self._light, T_world_camera)
 
 
 class _Body(NamedTuple):
@@ -199,7 +202,7 @@ class _Image:
         return made
 
     def add(self, number: int, body: _Body, T_camera_body: Array, corners: Array) -> None:
-        """Draw a body where it is nearer than what is there; `corners` as `lit` has them."""
+        """Draw a body where it is nearer than what is there; `corners` as `hidden` has them."""
         pixels = self._around(corners)
         if not len(pixels):
             return
@@ -280,44 +283,14 @@ class _Image:
         pixels = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)).ravel()
         return pixels[self.depth[pixels] > corners[:, 2].min()]
 
-    def lit(
-        self, bodies: Sequence[_Body], Ts_camera_body: Array, corners: Array, to_light: Array
-    ) -> _Floats:
-        """The cosine of the angle between surface and light `(n,)`; 0 in shadow and on far sides.
+    def facing(self, to_light: Array) -> _Floats:
+        """The cosine of the angle between surface and light `(n,)`, 0 on far sides.
 
-        Rays towards the light are cast from every second pixel of every second row, and from others
-        where those around them disagree or show other bodies.
-
-        Args:
-            bodies: by their number.
-            Ts_camera_body: where they are `(m, 4, 4)`.
-            corners: of the boxes around them, in the camera's frame `(m, 8, 3)`.
-            to_light: the light's direction `(3,)` in the camera's frame.
+        `to_light (3,)` is the light's direction in the camera's frame.
         """
-        width, height = self._size
-        facing = np.maximum(self.normal @ to_light.astype(np.float32), np.float32(0))
-        towards = facing > 0
-        hidden = np.zeros(len(facing), bool)
-        pixels = np.arange(len(facing)).reshape(height, width)[::2, ::2]
-        first = pixels[towards[pixels]]
-        hidden[first] = self._hidden(first, bodies, Ts_camera_body, corners, to_light)
-        # What a pixel shows, and whether in the light; on a far side it is neither.
-        kind = np.where(towards, 2 * self.body + hidden, -1)
-        above, left = np.arange(height) // 2, np.arange(width) // 2
-        below = np.minimum((np.arange(height) + 1) // 2, len(pixels) - 1)
-        right = np.minimum((np.arange(width) + 1) // 2, pixels.shape[1] - 1)
-        coarse = kind[pixels]
-        upper, lower = coarse[above], coarse[below]
-        around = upper[:, left]
-        same = (around == upper[:, right]) & (around == lower[:, left])
-        same &= (around == lower[:, right]) & (around >> 1 == self.body.reshape(height, width))
-        hidden = (same & (around & 1 == 1)).ravel()
-        rest = np.flatnonzero(towards & ~same.ravel())
-        hidden[rest] = self._hidden(rest, bodies, Ts_camera_body, corners, to_light)
-        facing[hidden] = 0.0
-        return facing
+        return np.maximum(self.normal @ to_light.astype(np.float32), np.float32(0))
 
-    def _hidden(
+    def hidden(
         self,
         pixels: _Indices,
         bodies: Sequence[_Body],
@@ -325,7 +298,15 @@ class _Image:
         corners: Array,
         to_light: Array,
     ) -> NDArray[np.bool_]:
-        """Whether what pixels show is in the shadow of a body; other arguments as of `lit`."""
+        """Whether what pixels show is in the shadow of a body.
+
+        Args:
+            pixels: which.
+            bodies: by their number.
+            Ts_camera_body: where they are `(m, 4, 4)`.
+            corners: of the boxes around them, in the camera's frame `(m, 8, 3)`.
+            to_light: the light's direction `(3,)` in the camera's frame.
+        """
         hidden = np.zeros(len(pixels), bool)
         # Two directions across the light, and the one towards it.
         R = np.linalg.svd(to_light[None])[2][[1, 2, 0]]
@@ -355,18 +336,18 @@ class _Image:
         return hidden
 
     def shown(
-        self, lit: _Floats, palette: _Floats, light: Light, T_world_camera: Array
+        self, facing: _Floats, palette: _Floats, light: Light, T_world_camera: Array
     ) -> CameraView:
         """The image as it is.
 
         Args:
-            lit: the part of the light's intensity that each pixel's surface gets `(n,)`.
+            facing: the part of the light's intensity that each pixel's surface gets `(n,)`.
             palette: colours `(m, 3)` in [0, 1].
             light: the light.
             T_world_camera: where the camera is `(4, 4)`.
         """
         width, height = self._size
-        bright = 255 * (np.float32(light.ambient) + np.float32(light.intensity) * lit)
+        bright = 255 * (np.float32(light.ambient) + np.float32(light.intensity) * facing)
         rgb = palette.take(self.colour, axis=0, mode="wrap") * bright[:, None]
         rgb = np.minimum(rgb + np.float32(0.5), np.float32(255)).astype(np.uint8)
         nothing = self.colour < 0
