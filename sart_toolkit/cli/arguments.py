@@ -362,6 +362,8 @@ class Augment:
 
     Example: sart augment demos/*.h5 --out dataset --strategy bc
 
+    Example: sart augment demo.h5 annotation.json --out plan.jsonl --dry-run
+
     Each annotation finds its demonstration; trajectories are allocated to the spheres of all. With
     --source cloud, images are read as the annotation says, where its spheres were suggested from
     them; flags about the sensor replace that. An interrupted generation resumes when the same
@@ -376,7 +378,7 @@ class Augment:
             help_behavior_hint="",
         ),
     ]
-    out: Annotated[Path, arg(help="Directory to write.")]
+    out: Annotated[Path, arg(help="Directory to write; with --dry-run a file of JSON lines.")]
     n: _N = None
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
@@ -411,6 +413,13 @@ class Augment:
     ] = 0.0002
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     seed: _SEED = 0
+    dry_run: Annotated[
+        bool,
+        arg(
+            help="Execute nothing: write the segments that would be attempted, each with its pose "
+            "and proof, or why it would be rejected."
+        ),
+    ] = False
     workers: _WORKERS = 1
     overwrite: _OVERWRITE = False
     json: _JSON = False
