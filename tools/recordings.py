@@ -1,8 +1,8 @@
 """Which recording trains better: `python tools/recordings.py DIR --out recordings.json`.
 
-For each task, seed and recording (segments recorded on the way out and reversed, or on the return) a
-whole `sart run` in DIR: the same demonstration, spheres, draws, training seed and placements for both.
-Interrupted, it resumes. Prints one JSON object.
+For each task, seed and recording (segments recorded on the way out and reversed, or on the return)
+a whole `sart run` in DIR: the same demonstration, spheres, draws, training seed and placements for
+both. Interrupted, it resumes. Prints one JSON object.
 """
 
 from __future__ import annotations
