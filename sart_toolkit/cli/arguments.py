@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from sart_toolkit.augment import STRATEGIES
+
 
 def _optional(metavar: str, help: str) -> Any:
     """A flag that may be left out, what happens then being in its help."""
@@ -48,8 +50,8 @@ _STRATEGY = Annotated[
     str,
     arg(
         metavar="REF",
-        help="sart: straight lines; sart_planned: round obstacles where these are blocked; an "
-        "ablation or baseline of docs/strategies.md, such as miles or bc; or your own.",
+        help=f"How segments are drawn, as in docs/strategies.md: {', '.join(STRATEGIES)}; or your "
+        "own.",
     ),
 ]
 _POLICY = Annotated[
