@@ -28,6 +28,7 @@ from sart_toolkit.data.records import (
     Annotation,
     Demonstration,
     Rates,
+    Recording,
     Referring,
     library_versions,
 )
@@ -62,6 +63,7 @@ from sart_toolkit.workers import Workers
 
 if TYPE_CHECKING:
     from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.augment.preview import Preview
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
     from sart_toolkit.backends.interface import Backend, BackendFactory
@@ -73,6 +75,7 @@ if TYPE_CHECKING:
     from sart_toolkit.learn.training import TrainConfig
     from sart_toolkit.record.session import Device, DeviceSetup, SessionConfig
     from sart_toolkit.robots.spec import ImageSize, RobotSpec
+    from sart_toolkit.scenes.spec import SceneSpec
     from sart_toolkit.tasks.task import Placement, Task
 
     RobotLike = str | RobotSpec
@@ -185,14 +188,22 @@ def backend_maker(
         UnknownName: the robot, the task or the backend can't be found.
         InvalidInput: the appearance that the recording notes is none.
     """
-    spec, scene = robot_of(source, robot), task_of(source, task).scene
+    spec, scene = _setting(source, task, robot)
     made = _find(source, "backend", backend, get_backend)
+    return functools.partial(make_backend, made, spec, scene, image_size, rates)
+
+
+def _setting(
+    source: Referring, task: TaskLike | None, robot: RobotLike | None
+) -> tuple[RobotSpec, SceneSpec]:
+    """The robot and the scene of a recording or skill, as they looked when it was made."""
+    spec, scene = robot_of(source, robot), task_of(source, task).scene
     if isinstance(source, Demonstration) and "appearance" in source.task_parameters:
         from sart_toolkit.scenes.appearance import Appearance
 
         appearance = Appearance.from_json(source.task_parameters["appearance"])
         spec, scene = appearance.applied(spec, scene)
-    return functools.partial(make_backend, made, spec, scene, image_size, rates)
+    return spec, scene
 
 
 def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
@@ -527,6 +538,83 @@ def augment(
         Mismatch: an annotation belongs to none of the demonstrations, or these look different.
         InvalidInput, MissingCapability, OutputExists, CannotWrite: as `augment_sources`.
     """
+    sources, config = _asked_for(demo, annotation, task, robot, backend, sensor, options)
+    from sart_toolkit.augment.engine import augment_sources
+
+    first = sources[0][0]
+    size, rates = image_size_of(first), first.rates
+    make = backend_maker(first, size, rates, task, robot, backend)
+    return augment_sources(
+        sources, make, out, config, workers, overwrite,
+        lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
+    )  # fmt: skip
+
+
+@_alone
+def preview(
+    demo: Path | Sequence[Path],
+    annotation: Path | Sequence[Path],
+    out: Path,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+    workers: int | Workers = 1,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    sensor: SensorErrors | None = None,
+    **options: Any,
+) -> Preview:
+    """What `augment` with the same arguments would attempt, planned and proved, in a file `out`.
+
+    Nothing is executed and no backend is made, so that it may be looked at before a robot moves.
+
+    Args:
+        demo, annotation: as for `augment`.
+        out: JSON lines: the settings, then each attempt with its pose and certificate.
+        task, robot, backend: in place of those that the demonstrations note.
+        workers: how many processes, or `Workers` elsewhere.
+        overwrite: whether `out` may be replaced.
+        progress: called with the segments proved.
+        sensor: as for `augment`.
+        options: of `AugmentConfig`.
+
+    Raises:
+        MissingFile, BrokenFile: a file can't be read.
+        UnknownName: task, robot or backend can't be found.
+        Mismatch: an annotation belongs to none of the demonstrations, or these look different.
+        InvalidInput, OutputExists, CannotWrite: as `preview_sources`.
+    """
+    check_writable(out, overwrite)
+    sources, config = _asked_for(demo, annotation, task, robot, backend, sensor, options)
+    from sart_toolkit.augment.preview import preview_sources
+
+    first = sources[0][0]
+    return preview_sources(
+        sources, *_setting(first, task, robot),
+        _find(first, "backend", backend, get_backend).tracking_error, out, config, workers,
+        overwrite,
+        lambda proved, wanted, rejected: progress("plan", proved, wanted, f"{rejected} rejected"),
+    )  # fmt: skip
+
+
+def _asked_for(
+    demo: Path | Sequence[Path],
+    annotation: Path | Sequence[Path],
+    task: TaskLike | None,
+    robot: RobotLike | None,
+    backend: BackendLike | None,
+    sensor: SensorErrors | None,
+    options: dict[str, Any],
+) -> tuple[list[tuple[Demonstration, Annotation | None]], AugmentConfig]:
+    """What `augment` generates from, and how.
+
+    Raises:
+        MissingFile, BrokenFile: a file can't be read.
+        UnknownName: task, robot or backend can't be found.
+        Mismatch: an annotation belongs to none of the demonstrations, or these look different.
+        InvalidInput: an option is not acceptable.
+    """
     strategy = options.get("strategy", "sart")
     check_names(task=task, robot=robot, backend=backend, strategy=strategy)
     demos = [demo] if isinstance(demo, Path) else list(demo)
@@ -534,10 +622,9 @@ def augment(
     for path, (demonstration, _) in zip(demos, sources, strict=True):
         _check(demonstration, robot_of(demonstration, robot), str(path))
     sources = [(noted(d, task, robot, backend), spheres) for d, spheres in sources]
-    first, annotated = sources[0][0], [a for _, a in sources if a is not None]
+    annotated = [a for _, a in sources if a is not None]
     from sart_toolkit.augment import get_strategy
     from sart_toolkit.augment.config import AugmentConfig
-    from sart_toolkit.augment.engine import augment_sources
 
     draws = get_strategy(strategy).draws
     if not draws:
@@ -554,12 +641,7 @@ def augment(
     for demonstration, spheres in sources:
         if spheres is not None:
             _warn_of_unproved(demonstration, spheres, config, task, robot)
-    size, rates = image_size_of(first), first.rates
-    make = backend_maker(first, size, rates, task, robot, backend)
-    return augment_sources(
-        sources, make, out, config, workers, overwrite,
-        lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
-    )  # fmt: skip
+    return sources, config
 
 
 def _sources(
@@ -863,6 +945,7 @@ def run(
     episodes: int = 50,
     epochs: int | None = None,
     distribution: Literal["paper", "area"] = "paper",
+    recording: Recording = "reversed",
     cameras: Sequence[str] = ("wrist",),
     image_size: ImageSize = 128,
     seed: int = 0,
@@ -892,6 +975,7 @@ def run(
         episodes: rollouts with random placements.
         epochs: of training, the policy's own if None.
         distribution: how positions are drawn on a sphere.
+        recording: whether segments are recorded on the way out and reversed, or on the return.
         cameras: whose images are recorded and trained on.
         image_size: width and height of recorded images [pixels]; one number for a square.
         seed: of all that is random, except evaluation.
@@ -929,6 +1013,7 @@ def run(
     get_backend(backend)
     generation: dict[str, Any] = {
         "n": n, "strategy": strategy, "sampling": SamplingConfig(distribution), "seed": seed,
+        "recording": recording,
     }  # fmt: skip
     drawn = AugmentConfig(**generation)
     training: dict[str, Any] = {
@@ -951,6 +1036,7 @@ def run(
         "cameras": list(cameras),
         "image_size": list(size),
         "distribution": distribution,
+        "recording": recording,
         "epochs": epochs,
         "device": device,
     }

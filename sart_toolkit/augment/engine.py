@@ -11,10 +11,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from sart_toolkit.augment import get_strategy
-from sart_toolkit.augment.allocation import allocate
+from sart_toolkit.augment.allocation import Allocation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import get_executor
 from sart_toolkit.backends.interface import Backend, BackendFactory
@@ -27,8 +24,6 @@ from sart_toolkit.workers import Workers, worker_map
 from sart_toolkit.workers.parcels import Output
 
 _log = logging.getLogger(__name__)
-_LEAST_ATTEMPTS = 20
-_ATTEMPTS_PER_EPISODE = 10
 
 
 class _Result(NamedTuple):
@@ -134,19 +129,8 @@ def augment_sources(
     # All that can be refused is refused before anything is replaced.
     check_sources(sources)
     workers = Workers.of(workers)
-    strategy = get_strategy(config.strategy)
-    drawn = [
-        (source, i, sphere)
-        for source, (demonstration, annotation) in enumerate(sources)
-        for i, sphere in enumerate(strategy.spheres(demonstration, annotation))
-    ]
-    wanted = _wanted(config, len(sources), strategy.draws)
-    weights = strategy.weights([sphere for *_, sphere in drawn], config.allocation)
-    shares = [
-        SphereShare(source, i, sphere.waypoint, share)
-        for (source, i, sphere), share in zip(drawn, allocate(wanted, weights), strict=True)
-    ]
     demonstrations = [demonstration for demonstration, _ in sources]
+    allocation = Allocation(sources, config)
     with closing(make_backend()) as backend:
         executor = get_executor(config.execution, backend, demonstrations)
         if not workers.here and not executor.parallel:
@@ -154,7 +138,7 @@ def augment_sources(
                 f"workers: execution {config.execution!r} needs 1 process, got {workers.count} of "
                 f"executor {workers.executor!r}"
             )
-        if drawn:
+        if allocation.shares:
             executor.check(backend, demonstrations, config)
         request = _request(backend, config)
     started = time.perf_counter()
@@ -164,55 +148,21 @@ def augment_sources(
 
         resumed = writer.n_kept + writer.n_rejected > 0
 
-        def missing() -> list[AttemptKey]:
-            """The attempts still needed, no more than can all be kept."""
-            most = []
-            for share in shares:
-                kept, made = writer.count(share.source, share.sphere)
-                most.append(kept if made >= _limit(share) else np.inf)
-            keys: list[AttemptKey] = []
-            for share, quota in zip(shares, allocate(wanted, weights, most), strict=True):
-                keys += writer.missing(share.source, share.sphere, quota, _limit(share))
-            return sorted(keys, key=lambda key: (key.k, key.source, key.sphere))
-
         make_worker = functools.partial(
             _Worker, make_backend, writer.sources, Output(writer.path), config
         )
         with _results(make_worker, workers) as results:
-            while keys := missing():
+            while keys := allocation.missing(writer.tally):
                 for key, entry, rejection, _ in results(keys):
                     if entry is None:
                         writer.reject(key, rejection)
                     else:
                         writer.keep(entry)
                     if progress is not None:
-                        progress(writer.n_kept, wanted, writer.n_rejected)
+                        progress(writer.n_kept, allocation.wanted, writer.n_rejected)
         # How long an interrupted generation took in all is not known.
         seconds = None if resumed else time.perf_counter() - started
-        return _finish(writer, sources[0][0], config, shares, seconds)
-
-
-def _wanted(config: AugmentConfig, demonstrations: int, draws: bool) -> int:
-    """How many trajectories are to be generated.
-
-    Raises:
-        InvalidInput: the demonstrations are too many, or other than n where nothing is drawn.
-    """
-    if draws and config.n <= demonstrations:
-        raise InvalidInput(
-            f"n: expected more than the {demonstrations} demonstrations, got {config.n}"
-        )
-    if not draws and config.n != demonstrations:
-        raise InvalidInput(
-            f"n: strategy {config.strategy!r} draws nothing, so expected the number of "
-            f"demonstrations ({demonstrations}), got {config.n}"
-        )
-    return config.n - demonstrations
-
-
-def _limit(share: SphereShare) -> int:
-    """How many attempts a sphere has; a share is not asked of it again and again in vain."""
-    return max(_LEAST_ATTEMPTS, _ATTEMPTS_PER_EPISODE * (share.wanted or 0))
+        return _finish(writer, sources[0][0], config, allocation.shares, seconds)
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:

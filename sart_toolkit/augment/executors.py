@@ -140,13 +140,18 @@ class SegmentExecutor(abc.ABC):
         return Episode(run.steps(), provenance, path)
 
 
+def rejected_outcome(error: Unreachable | MotionRejected) -> str:
+    """The outcome of an attempt that ended with an error: the same for all that fail alike."""
+    # What stands behind the colon differs each time.
+    return "out of reach" if isinstance(error, Unreachable) else str(error).partition(":")[0]
+
+
 def rejected(
     key: AttemptKey, error: Unreachable | MotionRejected, run: SegmentRun | None = None
 ) -> Attempt:
     """The attempt that an error ended, `run` being what was executed of it."""
-    # What stands behind the colon differs each time.
-    outcome = "out of reach" if isinstance(error, Unreachable) else str(error).partition(":")[0]
-    return Attempt(key, outcome, None, str(error), 0.0 if run is None else run.seconds)
+    outcome, seconds = rejected_outcome(error), 0.0 if run is None else run.seconds
+    return Attempt(key, outcome, None, str(error), seconds)
 
 
 class RestoreExecutor(SegmentExecutor):

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from sart_toolkit.augment import STRATEGIES
 from sart_toolkit.errors import InvalidInput
 
 
@@ -77,8 +78,8 @@ _STRATEGY = Annotated[
     str,
     arg(
         metavar="REF",
-        help="sart: straight lines; sart_planned: round obstacles where these are blocked; an "
-        "ablation or baseline of docs/strategies.md, such as miles or bc; or your own.",
+        help=f"How segments are drawn, as in docs/strategies.md: {', '.join(STRATEGIES)}; or your "
+        "own.",
     ),
 ]
 _POLICY = Annotated[
@@ -87,6 +88,13 @@ _POLICY = Annotated[
         "REF",
         "Policy: compact_mlp, resnet18_mlp as in the paper, replay, or your own; what the strategy "
         "is for if left out (compact_mlp, or replay).",
+    ),
+]
+_RECORDING = Annotated[
+    Literal["reversed", "return"],
+    arg(
+        help="Which way is recorded: out, reversed as in the paper, or the return, on which "
+        "the robot lags behind its commands as it does when a policy acts."
     ),
 ]
 _N = Annotated[
@@ -186,6 +194,7 @@ class Run:
     cameras: _CAMERAS = "wrist"
     image_size: _IMAGE = "128"
     distribution: _DISTRIBUTION = "paper"
+    recording: _RECORDING = "reversed"
     epochs: _EPOCHS = None
     workers: _WORKERS = 2
     executor: _EXECUTOR = "processes"
@@ -385,6 +394,8 @@ class Augment:
 
     Example: sart augment demos/*.h5 --out dataset --strategy bc
 
+    Example: sart augment demo.h5 annotation.json --out plan.jsonl --dry-run
+
     Each annotation finds its demonstration; trajectories are allocated to the spheres of all. With
     --source cloud, images are read as the annotation says, where its spheres were suggested from
     them; flags about the sensor replace that. An interrupted generation resumes when the same
@@ -399,7 +410,7 @@ class Augment:
             help_behavior_hint="",
         ),
     ]
-    out: Annotated[Path, arg(help="Directory to write.")]
+    out: Annotated[Path, arg(help="Directory to write; with --dry-run a file of JSON lines.")]
     n: _N = None
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
@@ -420,13 +431,7 @@ class Augment:
             "where the joints need it."
         ),
     ] = 2.0
-    recording: Annotated[
-        Literal["reversed", "return"],
-        arg(
-            help="Which way is recorded: out, reversed as in the paper, or the return, on which "
-            "the robot lags behind its commands as it does when a policy acts."
-        ),
-    ] = "reversed"
+    recording: _RECORDING = "reversed"
     source: _SOURCE = "scene"
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
@@ -440,6 +445,13 @@ class Augment:
     ] = 0.0002
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     seed: _SEED = 0
+    dry_run: Annotated[
+        bool,
+        arg(
+            help="Execute nothing: write the segments that would be attempted, each with its pose "
+            "and proof, or why it would be rejected."
+        ),
+    ] = False
     workers: _WORKERS = 1
     executor: _EXECUTOR = "processes"
     ray_address: _RAY_ADDRESS = None

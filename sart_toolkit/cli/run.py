@@ -25,6 +25,7 @@ def run_verb(args: Run) -> dict[str, Any]:
             episodes=args.episodes,
             epochs=args.epochs,
             distribution=args.distribution,
+            recording=args.recording,
             cameras=args.cameras.split(","),
             image_size=args.image_size,
             seed=args.seed,

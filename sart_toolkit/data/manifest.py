@@ -6,6 +6,8 @@ each further one how an attempt ended. Where two are of one attempt the later co
 
 from __future__ import annotations
 
+import collections
+import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,6 +54,29 @@ class EpisodeEntry:
     def name(self) -> str:
         """The episode's file in the dataset directory."""
         return episode_name(self.key)
+
+
+class AttemptTally:
+    """How many attempts from each sphere were made and kept, and which are to be made next."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[int, int], set[int]] = collections.defaultdict(set)
+        self._kept: dict[tuple[int, int], int] = collections.Counter()
+
+    def add(self, key: AttemptKey, kept: bool) -> None:
+        """Count an attempt that was made."""
+        self._made[key[:2]].add(key.k)
+        self._kept[key[:2]] += kept
+
+    def count(self, source: int, sphere: int) -> tuple[int, int]:
+        """How many attempts from a sphere were kept so far, and how many were made."""
+        return self._kept[source, sphere], len(self._made[source, sphere])
+
+    def missing(self, source: int, sphere: int, wanted: int, limit: int) -> list[AttemptKey]:
+        """The attempts from a sphere by which `wanted` could be kept, no k beyond `limit`."""
+        made = self._made[source, sphere]
+        new = (AttemptKey(source, sphere, k) for k in range(limit) if k not in made)
+        return list(itertools.islice(new, max(0, wanted - self._kept[source, sphere])))
 
 
 class Rejection(NamedTuple):

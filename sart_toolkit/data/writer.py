@@ -19,6 +19,7 @@ from sart_toolkit.data.dataset import (
 )
 from sart_toolkit.data.manifest import (
     AttemptKey,
+    AttemptTally,
     EpisodeEntry,
     Manifest,
     Rejection,
@@ -118,6 +119,7 @@ class DatasetWriter:
         files: writes the episodes, in this process or another.
         sources: the demonstrations in the directory, with their annotations.
         finished: the dataset, if it is whole already.
+        tally: the attempts that were made so far.
     """
 
     def __init__(
@@ -160,6 +162,9 @@ class DatasetWriter:
             self.files = EpisodeFiles(path)
             self.sources = manifest_sources(path, self._manifest)
             self.finished = self._checked()
+            self.tally = AttemptTally()
+            for key in (*self._manifest.kept, *self._manifest.rejected):
+                self.tally.add(key, key in self._manifest.kept)
             if self.finished is None:
                 self._save_sources(sources)
         except BaseException:
@@ -247,19 +252,6 @@ class DatasetWriter:
         """Why the last attempt without an episode gave none."""
         return next(reversed(self._manifest.rejected.values()), None)
 
-    def count(self, source: int, sphere: int) -> tuple[int, int]:
-        """How many attempts from a sphere were kept so far, and how many were made."""
-        here = (source, sphere)
-        kept = sum(key[:2] == here for key in self._manifest.kept)
-        return kept, kept + sum(key[:2] == here for key in self._manifest.rejected)
-
-    def missing(self, source: int, sphere: int, wanted: int, limit: int) -> list[AttemptKey]:
-        """The attempts from a sphere by which `wanted` could be kept, no k beyond `limit`."""
-        kept, rejected = self._manifest.kept, self._manifest.rejected
-        keys = [AttemptKey(source, sphere, k) for k in range(limit)]
-        missing = [key for key in keys if key not in kept and key not in rejected]
-        return missing[: max(0, wanted - sum(key in kept for key in keys))]
-
     def keep(self, entry: EpisodeEntry) -> None:
         """Take an episode in whose file is written; it is kept for good when this returns.
 
@@ -267,6 +259,7 @@ class DatasetWriter:
             CannotWrite: the disk refuses.
         """
         self._append(kept_row(entry))
+        self.tally.add(entry.key, True)
 
     def reject(self, key: AttemptKey, rejection: Rejection) -> None:
         """Note that an attempt gave no episode, and why.
@@ -275,6 +268,7 @@ class DatasetWriter:
             CannotWrite: the disk refuses.
         """
         self._append(rejected_row(key, rejection))
+        self.tally.add(key, False)
 
     def _append(self, row: Mapping[str, Any]) -> None:
         self._journal.append(row)

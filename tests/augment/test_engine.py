@@ -15,7 +15,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from sart_toolkit.augment import STRATEGIES, engine, get_strategy
+from sart_toolkit.augment import STRATEGIES, allocation, engine, get_strategy
 from sart_toolkit.augment.allocation import allocate
 from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration, augment_sources
@@ -344,8 +344,8 @@ def test_what_a_sphere_cannot_give_is_asked_of_the_others_and_said_with_the_reas
 def test_what_no_sphere_can_give_leaves_fewer_trajectories_and_a_warning(
     annotate, augment, tmp_path, caplog, monkeypatch
 ):
-    monkeypatch.setattr(engine, "_LEAST_ATTEMPTS", 3)
-    monkeypatch.setattr(engine, "_ATTEMPTS_PER_EPISODE", 1)
+    monkeypatch.setattr(allocation, "_LEAST_ATTEMPTS", 3)
+    monkeypatch.setattr(allocation, "_ATTEMPTS_PER_EPISODE", 1)
     spheres = annotate((0, 0.01), (34, 1.5))
     with caplog.at_level(logging.WARNING):
         dataset = augment(
