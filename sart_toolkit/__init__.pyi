@@ -16,6 +16,8 @@ from .augment.engine import (
     augment_sources as augment_sources,
 )
 from .augment.executors import SegmentExecutor as SegmentExecutor
+from .augment.preview import Preview as Preview
+from .augment.preview import preview_sources as preview_sources
 from .augment.strategies import Proposal as Proposal
 from .augment.strategies import Strategy as Strategy
 from .augment.validate import validate_dataset as validate_dataset

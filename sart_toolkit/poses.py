@@ -209,13 +209,26 @@ def apply_motion(T_world_from: Array, motion: Array) -> Array:
     return T
 
 
+class StraightLine:
+    """Poses on a straight line: p linear, R geodesic (not an SE(3) screw)."""
+
+    def __init__(self, T_a: Array, T_b: Array) -> None:
+        """From pose `T_a` to `T_b`, both `(4, 4)`."""
+        self._p_a, self._p_b = T_a[:3, 3], T_b[:3, 3]
+        self._R_a = T_a[:3, :3]
+        self._rotvec = log_rotation(self._R_a.T @ T_b[:3, :3])
+
+    def __call__(self, s: float) -> Array:
+        """The pose `(4, 4)` at fraction `s`."""
+        T = np.eye(4)
+        T[:3, 3] = (1.0 - s) * self._p_a + s * self._p_b
+        T[:3, :3] = orthonormalised(self._R_a @ exp_rotation(s * self._rotvec))
+        return T
+
+
 def interpolate(T_a: Array, T_b: Array, s: float) -> Array:
-    """The pose at fraction `s` of the straight line: p linear, R geodesic (not an SE(3) screw)."""
-    T = np.eye(4)
-    T[:3, 3] = (1.0 - s) * T_a[:3, 3] + s * T_b[:3, 3]
-    R = T_a[:3, :3]
-    T[:3, :3] = orthonormalised(R @ exp_rotation(s * log_rotation(R.T @ T_b[:3, :3])))
-    return T
+    """The pose at fraction `s` of the `StraightLine` between two poses."""
+    return StraightLine(T_a, T_b)(s)
 
 
 def orthonormalised(R: Array) -> Array:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sart_toolkit.augment.strategies import Strategy
 from sart_toolkit.collision import SOURCES, Source
 from sart_toolkit.collision.phases import IN_GRASP_SLIP
 from sart_toolkit.collision.sensor import CloudConfig
+from sart_toolkit.data.records import Recording
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
@@ -26,16 +27,18 @@ ALLOCATIONS = ("radius", "equal")
 class AugmentConfig:
     """What to generate.
 
-    `n`: trajectories in all, the demonstrations among them; `quotas` allocates the others to the
-    spheres, weighted by radius, or with `allocation` "equal" all the same, as in the paper.
+    `n`: trajectories in all, the demonstrations among them; the others are allocated to the spheres
+    (see `allocate`) weighted by radius, or with `allocation` "equal" all the same, as in the paper.
     `duration` [s] is the paper's delta, the least that a segment takes, rounded up to whole
     recorded steps. Every segment is proved to keep `margin` [m] free of the `obstacles`, the bodies
     of the scene or the cloud that the demonstration's cameras saw (made as `cloud` says): as
     measured, even if what is grasped has slipped by `slip_tolerance` [m] and bodies have moved by
     `BODY_STILLNESS`; as commanded, even if the robot is off its path by its backend's
     `tracking_error` besides. A segment on which any of these was exceeded is rejected. `cameras`:
-    whose images are recorded, `None` for those of the demonstration. `executor`: how segments are
-    executed.
+    whose images are recorded, `None` for those of the demonstration. `execution`: how segments are
+    executed, "auto" for whichever executor the backend and the demonstrations allow. `recording`:
+    "reversed" records the way out and reverses it, as the paper does; "return" records the way
+    back, so that the robot lags behind its commands as it will when a policy acts.
     `strategy` may be given as an object; its reference is kept.
     """
 
@@ -50,23 +53,28 @@ class AugmentConfig:
     cloud: CloudConfig = field(default_factory=CloudConfig)
     seed: int = 0
     cameras: tuple[str, ...] | None = None
-    executor: str = "restore"
+    execution: str = "auto"
+    recording: Recording = "reversed"
 
     def __post_init__(self) -> None:
-        if self.n < 2:
-            raise InvalidInput(f"n: expected at least 2 (the demonstration counts), got {self.n}")
+        least = 2 if get_strategy(self.strategy).draws else 1
+        if self.n < least:
+            raise InvalidInput(
+                f"n: expected at least {least} (the demonstration counts), got {self.n}"
+            )
         if self.seed < 0:
             raise InvalidInput(f"seed: expected a whole number >= 0, got {self.seed}")
         if self.allocation not in ALLOCATIONS:
             raise unknown_name("allocation", self.allocation, ALLOCATIONS)
         if self.obstacles not in SOURCES:
             raise unknown_name("obstacles", self.obstacles, SOURCES)
+        if self.recording not in get_args(Recording):
+            raise unknown_name("recording", self.recording, get_args(Recording))
         check_positive("duration", self.duration, "s")
         for name in ("margin", "slip_tolerance"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidInput(f"{name}: expected a finite number >= 0 m, got {value}")
-        get_strategy(self.strategy)
         if self.cameras is not None:
             object.__setattr__(self, "cameras", tuple(self.cameras))
         reference = lasting_reference("strategy", self.strategy, STRATEGIES)
@@ -83,23 +91,3 @@ class AugmentConfig:
         if "cloud" in values:
             cloud = CloudConfig.from_json(values["cloud"])
         return cls(**{**values, "sampling": sampling, "cloud": cloud})
-
-    def quotas(self, radii: Sequence[float], demonstrations: int = 1) -> list[int]:
-        """How many trajectories spheres of the given radii [m] get, of n less the demonstrations.
-
-        One after the other goes to the sphere with the greatest weight / (2 trajectories + 1)
-        (Webster's method), so that more trajectories never take one away from any sphere. With
-        equal weights that is round-robin.
-
-        Raises:
-            InvalidInput: the demonstrations alone are n.
-        """
-        if self.n <= demonstrations:
-            raise InvalidInput(
-                f"n: expected more than the {demonstrations} demonstrations, got {self.n}"
-            )
-        weights = np.ones(len(radii)) if self.allocation == "equal" else np.asarray(radii)
-        counts = np.zeros(len(radii), dtype=int)
-        for _ in range(self.n - demonstrations):
-            counts[np.argmax(weights / (2 * counts + 1))] += 1
-        return [int(count) for count in counts]

@@ -6,24 +6,23 @@ import dataclasses
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sart_toolkit.augment.allocation import Allocation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import get_executor
 from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.data.dataset import Dataset, Source
 from sart_toolkit.data.manifest import AttemptKey, EpisodeEntry, Rejection
 from sart_toolkit.data.records import Annotation, Demonstration
-from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles, check_sources
+from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles, SphereShare, check_sources
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.workers import worker_map
 
 _log = logging.getLogger(__name__)
-_LEAST_ATTEMPTS = 20
-_ATTEMPTS_PER_EPISODE = 10
 
 
 class _Result(NamedTuple):
@@ -47,7 +46,9 @@ class _Worker:
         self._files = files
         self._backend = make_backend()
         pairs = [(source.demonstration, source.annotation) for source in sources]
-        self._executor = get_executor(config.executor)(self._backend, pairs, config)
+        demonstrations = [source.demonstration for source in sources]
+        executor = get_executor(config.execution, self._backend, demonstrations)
+        self._executor = executor(self._backend, pairs, config)
 
     def results(self, keys: Iterable[AttemptKey]) -> Iterator[_Result]:
         """The results of attempts, one after the other, in the executor's order."""
@@ -69,7 +70,7 @@ class _Worker:
 
 def augment_demonstration(
     demonstration: Demonstration,
-    annotation: Annotation,
+    annotation: Annotation | None,
     make_backend: BackendFactory,
     out: Path,
     config: AugmentConfig | None = None,
@@ -83,7 +84,7 @@ def augment_demonstration(
 
 
 def augment_sources(
-    sources: Sequence[tuple[Demonstration, Annotation]],
+    sources: Sequence[tuple[Demonstration, Annotation | None]],
     make_backend: BackendFactory,
     out: Path,
     config: AugmentConfig | None = None,
@@ -93,12 +94,13 @@ def augment_sources(
 ) -> Dataset:
     """Generate a dataset directory from demonstrations of one task and their annotations.
 
-    The trajectories are allocated to the spheres of all demonstrations. Neither the number of
-    workers nor an interruption changes what is generated: called again with the same arguments it
-    resumes.
+    The trajectories are allocated to the spheres of all demonstrations; what a sphere can't give
+    is asked of the others. Neither the number of workers nor an interruption changes what is
+    generated: called again with the same arguments it resumes.
 
     Args:
-        sources: demonstrations, each with its precision spheres.
+        sources: demonstrations, each with its precision spheres, `None` where the strategy needs
+            none.
         make_backend: makes the robot in the demonstrations' scene; picklable if `workers` > 1.
         out: directory to write.
         config: what to generate.
@@ -114,25 +116,24 @@ def augment_sources(
         OutputExists: `out` holds something else and `overwrite` is false.
         CannotWrite: the disk refuses, or another process is at work on `out`.
         InvalidInput: no attempt from any sphere was kept, `workers` is not positive or more than
-            the executor can use, or there is no demonstration, or not fewer than trajectories
-            wanted.
+            the executor can use, there is no demonstration, or not fewer than trajectories wanted
+            (by a strategy that draws nothing: not as many), or no annotation where one is needed.
     """
     config = config or AugmentConfig()
     # All that can be refused is refused before anything is replaced.
     check_sources(sources)
-    executor = get_executor(config.executor)
     if workers < 1:
         raise InvalidInput(f"workers: expected at least 1, got {workers}")
-    if workers > 1 and not executor.parallel:
-        raise InvalidInput(f"workers: executor {config.executor!r} needs 1 process, got {workers}")
-    spheres = [
-        (source, sphere, annotation.spheres[sphere].radius)
-        for source, (_, annotation) in enumerate(sources)
-        for sphere in range(len(annotation.spheres))
-    ]
-    quotas = config.quotas([radius for *_, radius in spheres], len(sources))
+    demonstrations = [demonstration for demonstration, _ in sources]
+    allocation = Allocation(sources, config)
     with closing(make_backend()) as backend:
-        executor.check(backend, [demonstration for demonstration, _ in sources], config)
+        executor = get_executor(config.execution, backend, demonstrations)
+        if workers > 1 and not executor.parallel:
+            raise InvalidInput(
+                f"workers: executor {config.execution!r} needs 1 process, got {workers}"
+            )
+        if allocation.shares:
+            executor.check(backend, demonstrations, config)
         request = _request(backend, config)
     started = time.perf_counter()
     with DatasetWriter(out, sources, request, overwrite) as writer:
@@ -141,27 +142,19 @@ def augment_sources(
 
         resumed = writer.n_kept + writer.n_rejected > 0
 
-        def missing() -> list[AttemptKey]:
-            """The attempts still needed, no more than can all be kept."""
-            keys: list[AttemptKey] = []
-            for (source, sphere, _), quota in zip(spheres, quotas, strict=True):
-                limit = max(_LEAST_ATTEMPTS, _ATTEMPTS_PER_EPISODE * quota)
-                keys += writer.missing(source, sphere, quota, limit)
-            return sorted(keys, key=lambda key: (key.k, key.source, key.sphere))
-
         make_worker = functools.partial(_Worker, make_backend, writer.sources, writer.files, config)
         with _results(make_worker, workers) as results:
-            while keys := missing():
+            while keys := allocation.missing(writer.tally):
                 for key, entry, rejection in results(keys):
                     if entry is None:
                         writer.reject(key, rejection)
                     else:
                         writer.keep(entry)
                     if progress is not None:
-                        progress(writer.n_kept, sum(quotas), writer.n_rejected)
+                        progress(writer.n_kept, allocation.wanted, writer.n_rejected)
         # How long an interrupted generation took in all is not known.
         seconds = None if resumed else time.perf_counter() - started
-        return _finish(writer, sources[0][0], config, sum(quotas), seconds)
+        return _finish(writer, sources[0][0], config, allocation.shares, seconds)
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
@@ -190,18 +183,26 @@ def _finish(
     writer: DatasetWriter,
     demonstration: Demonstration,
     config: AugmentConfig,
-    wanted: int,
+    shares: Sequence[SphereShare],
     seconds: float | None,
 ) -> Dataset:
-    attempted = writer.n_kept + writer.n_rejected
-    reasons = ", ".join(f"{reason}: {count}" for reason, count in writer.rejections.items())
-    if not writer.n_kept:
+    wanted = sum(share.wanted or 0 for share in shares)
+    if wanted and not writer.n_kept:
         last = writer.last_rejection
         raise InvalidInput(
-            f"none of {attempted} attempts was kept ({reasons}); use smaller radii or other "
-            "waypoints" + (f"; the last: {last.detail}" if last and last.detail else "")
+            f"none of {writer.n_rejected} attempts was kept ({_listed(writer.rejections)}); use "
+            "smaller radii or other waypoints"
+            + (f"; the last: {last.detail}" if last and last.detail else "")
         )
+    for tally in writer.by_sphere(shares):
+        if tally["kept"] < tally["wanted"]:
+            _log.warning(
+                "sphere at waypoint %d of demonstration %d gave %d of %d trajectories (%s)",
+                tally["waypoint"], tally["source"], tally["kept"], tally["wanted"],
+                _listed(tally["rejections"]),
+            )  # fmt: skip
     if writer.n_kept < wanted:
+        reasons = _listed(writer.rejections)
         _log.warning("only %d of %d trajectories were kept (%s)", writer.n_kept, wanted, reasons)
     return writer.finish(
         {
@@ -211,5 +212,10 @@ def _finish(
             "simulated_seconds": writer.executed_seconds,
             "config": config.to_json(),
             "references": dict(demonstration.references),
-        }
+        },
+        shares,
     )
+
+
+def _listed(reasons: Mapping[str, int]) -> str:
+    return ", ".join(f"{reason}: {count}" for reason, count in reasons.items())

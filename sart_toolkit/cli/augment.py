@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -11,34 +12,39 @@ from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
 from sart_toolkit.data.sampling import SamplingConfig
-from sart_toolkit.errors import Mismatch
+from sart_toolkit.errors import InvalidInput, Mismatch
 
 
 def augment_verb(args: Augment) -> dict[str, Any]:
     """`sart augment`."""
     sensor = declared_sensor(args)
+    annotations = [path for path in args.files if path.suffix == ".json"]
+    demos = [path for path in args.files if path not in annotations]
+    if not demos:
+        raise InvalidInput("FILE: expected a demonstration, got annotations alone; add its .h5")
+    options: dict[str, Any] = {
+        "task": args.task,
+        "robot": args.robot,
+        "backend": args.backend,
+        "workers": args.workers,
+        "overwrite": args.overwrite,
+        "sensor": sensor,
+        **({} if args.n is None else {"n": args.n}),
+        "allocation": args.allocation,
+        "strategy": args.strategy,
+        "sampling": SamplingConfig(args.distribution, args.rotation_per_metre),
+        "duration": args.duration,
+        "recording": args.recording,
+        "margin": args.margin,
+        "slip_tolerance": args.slip_tolerance,
+        "obstacles": args.source,
+        "seed": args.seed,
+    }
     with ProgressDisplay() as progress:
-        dataset = pipeline.augment(
-            args.demo,
-            args.annotation,
-            args.out,
-            task=args.task,
-            robot=args.robot,
-            backend=args.backend,
-            workers=args.workers,
-            overwrite=args.overwrite,
-            progress=progress,
-            sensor=sensor,
-            n=args.n,
-            allocation=args.allocation,
-            strategy=args.strategy,
-            sampling=SamplingConfig(args.distribution, args.rotation_per_metre),
-            duration=args.duration,
-            margin=args.margin,
-            slip_tolerance=args.slip_tolerance,
-            obstacles=args.source,
-            seed=args.seed,
-        )
+        if args.dry_run:
+            planned = pipeline.preview(demos, annotations, args.out, progress=progress, **options)
+            return {"plan": str(args.out), **dataclasses.asdict(planned)}
+        dataset = pipeline.augment(demos, annotations, args.out, progress=progress, **options)
     return {"dataset": str(args.out), **describe_dataset(dataset)}
 
 

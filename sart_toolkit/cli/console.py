@@ -17,6 +17,7 @@ _UNITS = {
     "play": "image",
     "suggest": "waypoint",
     "augment": "trajectory",
+    "plan": "segment",
     "validate": "episode",
     "read": "trajectory",
     "train": "step",

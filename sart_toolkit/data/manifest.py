@@ -6,6 +6,8 @@ each further one how an attempt ended. Where two are of one attempt the later co
 
 from __future__ import annotations
 
+import collections
+import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,6 +56,29 @@ class EpisodeEntry:
         return episode_name(self.key)
 
 
+class AttemptTally:
+    """How many attempts from each sphere were made and kept, and which are to be made next."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[int, int], set[int]] = collections.defaultdict(set)
+        self._kept: dict[tuple[int, int], int] = collections.Counter()
+
+    def add(self, key: AttemptKey, kept: bool) -> None:
+        """Count an attempt that was made."""
+        self._made[key[:2]].add(key.k)
+        self._kept[key[:2]] += kept
+
+    def count(self, source: int, sphere: int) -> tuple[int, int]:
+        """How many attempts from a sphere were kept so far, and how many were made."""
+        return self._kept[source, sphere], len(self._made[source, sphere])
+
+    def missing(self, source: int, sphere: int, wanted: int, limit: int) -> list[AttemptKey]:
+        """The attempts from a sphere by which `wanted` could be kept, no k beyond `limit`."""
+        made = self._made[source, sphere]
+        new = (AttemptKey(source, sphere, k) for k in range(limit) if k not in made)
+        return list(itertools.islice(new, max(0, wanted - self._kept[source, sphere])))
+
+
 class Rejection(NamedTuple):
     """Why an attempt gave no episode: `outcome` is the same for all that fail alike.
 
@@ -96,11 +121,11 @@ def entry_of(episode: Episode, content_hash: str) -> EpisodeEntry:
 class Manifest:
     """What a dataset was asked for, and how its attempts ended.
 
-    `sources` has for each demonstration its content hash and its annotation's; `request` is
-    whatever else decides what is generated.
+    `sources` has for each demonstration its content hash and its annotation's, `None` without one;
+    `request` is whatever else decides what is generated.
     """
 
-    sources: tuple[tuple[str, str], ...]
+    sources: tuple[tuple[str, str | None], ...]
     request: Mapping[str, Any]
     kept: dict[AttemptKey, EpisodeEntry] = field(default_factory=dict)
     rejected: dict[AttemptKey, Rejection] = field(default_factory=dict)

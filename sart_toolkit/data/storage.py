@@ -21,13 +21,16 @@ import shutil
 import stat
 import tempfile
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import h5py
 import msgspec
 import numpy as np
+from isal import isal_zlib
+from numpy.typing import NDArray
 
 from sart_toolkit.data.records import (
     Annotation,
@@ -41,7 +44,7 @@ from sart_toolkit.data.records import (
     digest,
 )
 from sart_toolkit.data.schemas import AnnotationFile, Matrix, References
-from sart_toolkit.data.structure import inspect
+from sart_toolkit.data.structure import DEFLATE_LEVEL, inspect
 from sart_toolkit.errors import (
     BrokenFile,
     CannotWrite,
@@ -51,7 +54,7 @@ from sart_toolkit.errors import (
     SartError,
 )
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 
 # The largest files that are read as JSON, and as lines of JSON.
 MAX_JSON_BYTES = 16 * 2**20
@@ -291,6 +294,23 @@ def append_json_line(path: Path, value: Mapping[str, Any]) -> None:
     with _cannot_write(Path(path)), open(path, "ab+") as file:
         _drop_cut_line(file)
         file.write(_to_line(value))
+
+
+def write_json_lines(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write JSON objects as lines, the first with a `schema_version`, whole or not at all.
+
+    Args:
+        path: the file.
+        rows: what the lines are to hold, one in memory at a time.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    head: Mapping[str, Any] = {"schema_version": SCHEMA_VERSION}
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        for row in rows:
+            file.write(_to_line({**head, **row}))
+            head = {}
 
 
 def _drop_cut_line(file: io.BufferedRandom) -> None:
@@ -708,7 +728,7 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
     # A damaged file may hold anything in place of a group, a number or JSON.
     except (
         OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError,
-        OverflowError, lzma.LZMAError
+        OverflowError, lzma.LZMAError, zlib.error
     ) as error:  # fmt: skip
         raise BrokenFile(
             f"{path}: truncated or not a {kind} file ({error}); restore a copy or make it again"
@@ -743,18 +763,63 @@ def _put_steps(group: h5py.Group, steps: Steps) -> None:
     cameras = group.create_group("cameras")
     for name, camera in steps.cameras.items():
         at = cameras.create_group(name)
-        # One chunk an image, LZF: a tenth of gzip's time, and a step can be read by itself.
-        for part, frames in (("rgb", camera.rgb), ("depth", camera.depth)):
-            at.create_dataset(
-                part, data=frames, chunks=(1, *frames.shape[1:]), compression="lzf", shuffle=True
-            )
+        _put_frames(at, "rgb", camera.rgb)
+        _put_frames(at, "depth", camera.depth)
         at["intrinsics"] = camera.intrinsics
         at["T_frame_camera"] = camera.T_frame_camera
 
 
+def _put_frames(group: h5py.Group, name: str, frames: NDArray[Any]) -> None:
+    """Write images, each in a chunk of its own, so that a step can be read by itself.
+
+    They are stored as HDF5's own filters shuffle and DEFLATE would, which every HDF5 library reads;
+    ISA-L packs them in a fifth of the time.
+    """
+    stored = group.create_dataset(
+        name,
+        frames.shape,
+        frames.dtype,
+        chunks=(1, *frames.shape[1:]),
+        compression="gzip",
+        compression_opts=DEFLATE_LEVEL,
+        shuffle=frames.itemsize > 1,
+    )
+    for i, frame in enumerate(np.ascontiguousarray(frames)):
+        # All first bytes of the numbers, then all second ones, and so on.
+        shuffled = frame.reshape(-1).view(np.uint8).reshape(-1, frames.itemsize).T
+        packed = isal_zlib.compress(np.ascontiguousarray(shuffled), DEFLATE_LEVEL)
+        stored.id.write_direct_chunk((i, *(0 for _ in frame.shape)), packed)
+
+
+def _get_frames(stored: h5py.Dataset) -> NDArray[Any]:
+    """The images that `_put_frames` wrote.
+
+    HDF5 itself would unpack whatever a chunk says; here one never takes more than its image.
+
+    Raises:
+        ValueError: one unpacks to another size.
+    """
+    frames = np.empty(stored.shape, stored.dtype)
+    for i, frame in enumerate(frames):
+        _, packed = stored.id.read_direct_chunk((i, *(0 for _ in frame.shape)))
+        unpacker = zlib.decompressobj()
+        shuffled = unpacker.decompress(packed, frame.nbytes + 1)
+        if len(shuffled) != frame.nbytes or not unpacker.eof:
+            raise ValueError(f"{stored.name}: image {i} unpacks to another size")
+        rows = np.frombuffer(shuffled, np.uint8).reshape(frames.itemsize, -1)
+        frame[...] = np.ascontiguousarray(rows.T).view(frames.dtype).reshape(frame.shape)
+    return frames
+
+
 def _get_steps(group: h5py.Group, frames: Mapping[str, CameraFrame]) -> Steps:
     cameras = {
-        name: CameraRecord(frame=frame, **{k: v[()] for k, v in group["cameras"][name].items()})
+        name: CameraRecord(
+            frame=frame,
+            **{
+                part: _get_frames(stored) if part in ("rgb", "depth") else stored[()]
+                for part, stored in group["cameras"][name].items()
+            },
+        )
         for name, frame in sorted(frames.items())
     }
     if cameras.keys() != group["cameras"].keys():

@@ -18,7 +18,7 @@ from sart_toolkit.backends import BACKENDS
 from sart_toolkit.cli import main
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import Demonstration
-from sart_toolkit.data.storage import load_demonstration
+from sart_toolkit.data.storage import load_demonstration, read_json_lines
 from sart_toolkit.doctor import Finding
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.appearance import Appearance, AppearanceConfig
@@ -111,6 +111,19 @@ def test_same_seed_gives_the_same_bytes(
     assert run(capsys, *argv, "--out", tmp_path / "two", "--workers", 2)["content_hash"] == before
     other = run(capsys, *argv, "--out", tmp_path / "other", "--seed", 1)["content_hash"]
     assert other != before
+
+
+def test_a_dry_run_writes_what_would_be_executed(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = tmp_path / "plan.jsonl"
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--n", 5, "--dry-run"]
+    result = run(capsys, *argv, "--out", plan)
+    assert result["wanted"] == result["proved"] == 4 and result["plan"] == str(plan)
+    proved = [row for row in read_json_lines(plan)[1:] if row["outcome"] == "proved"]
+    index = load_dataset(chain / "data").index
+    assert [row["certificate"]["clearance"] for row in proved] == [e.clearance for e in index]
+    assert "already exists" in error(capsys, *argv, "--out", plan)
 
 
 def test_info_tells_each_kind_of_file(chain: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,6 +21,7 @@ VERBS = {
     "suggest": "suggest demo.h5 --out OUT --overwrite",
     "annotate": "annotate demo.h5 --suggest-all --no-window --out OUT --overwrite",
     "augment": "augment demo.h5 annotation.json --n 4 --out OUT --overwrite",
+    "augment --dry-run": "augment demo.h5 annotation.json --dry-run --out OUT --overwrite",
     "train": "train dataset --epochs 1 --out OUT --overwrite",
     "evaluate": "evaluate skill --episodes 1 --out OUT --overwrite",
     "report": "report run --out OUT --overwrite",

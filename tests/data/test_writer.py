@@ -30,7 +30,7 @@ def carry_out(source_of, episode_of):
         with DatasetWriter(path, sources, {"n": N}, **options) as writer:
             done = 0
             for sphere in (0, 1):
-                while keys := writer.missing(0, sphere, N, 99):
+                while keys := writer.tally.missing(0, sphere, N, 99):
                     for key in keys:
                         if done == stop_after:
                             return None
@@ -59,10 +59,10 @@ def test_what_is_missing_are_the_first_attempts_that_could_do(source_of, episode
     with DatasetWriter(tmp_path / "d", [(demonstration, annotation)], {}) as writer:
         writer.keep(writer.files.write(episode_of(demonstration, 1, 0)))
         writer.reject(AttemptKey(0, 1, 2), Rejection("joint jump", "detail"))
-        assert writer.missing(0, 1, 3, 9) == [AttemptKey(0, 1, 1), AttemptKey(0, 1, 3)]
-        assert writer.missing(0, 1, 9, 4) == [AttemptKey(0, 1, 1), AttemptKey(0, 1, 3)]
-        assert writer.missing(0, 1, 1, 9) == writer.missing(0, 1, 0, 9) == []
-        assert writer.missing(0, 0, 2, 9) == [AttemptKey(0, 0, 0), AttemptKey(0, 0, 1)]
+        assert writer.tally.missing(0, 1, 3, 9) == [AttemptKey(0, 1, 1), AttemptKey(0, 1, 3)]
+        assert writer.tally.missing(0, 1, 9, 4) == [AttemptKey(0, 1, 1), AttemptKey(0, 1, 3)]
+        assert writer.tally.missing(0, 1, 1, 9) == writer.tally.missing(0, 1, 0, 9) == []
+        assert writer.tally.missing(0, 0, 2, 9) == [AttemptKey(0, 0, 0), AttemptKey(0, 0, 1)]
         assert (writer.n_kept, writer.n_rejected) == (1, 1)
         assert writer.last_rejection == Rejection("joint jump", "detail")
 
