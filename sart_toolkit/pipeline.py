@@ -735,6 +735,72 @@ def validate(
     )  # fmt: skip
 
 
+def merge(
+    datasets: Sequence[Path], out: Path, *, overwrite: bool = False, progress: Progress = _silent
+) -> Dataset:
+    """One dataset, in directory `out`, of several of one task and robot.
+
+    Args:
+        datasets: directories from `augment`, `merge` or `split`.
+        out: directory to write; an interrupted merge resumes.
+        overwrite: whether a dataset in `out` may be replaced.
+        progress: called with the episodes done.
+
+    Raises:
+        MissingFile, BrokenFile: a dataset can't be read.
+        InvalidInput, Mismatch, OutputExists, CannotWrite: as `merge_datasets`.
+    """
+    from sart_toolkit.data.combine import merge_datasets
+
+    found = [load_dataset(path) for path in datasets]
+    return merge_datasets(found, out, overwrite, lambda *counts: progress("merge", *counts))
+
+
+def split(
+    dataset: Path,
+    out: Path,
+    *,
+    parts: Mapping[str, float] | None = None,
+    n: int | None = None,
+    by_source: bool = False,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Dataset]:
+    """Parts of a dataset as datasets of their own, by their names.
+
+    Args:
+        dataset: directory from `augment`, `merge` or `split`.
+        out: directory to write; an interrupted split resumes.
+        parts: the fraction of the episodes that each part gets, by its name; written to `out/NAME`.
+        n: one part of so many trajectories, written to `out` itself.
+        by_source: a part for each demonstration, written to `out/demoNN`.
+        seed: of which episodes `parts` get.
+        overwrite: whether datasets that are there may be replaced.
+        progress: called with the episodes done.
+
+    Raises:
+        MissingFile, BrokenFile: the dataset can't be read.
+        InvalidInput: not exactly one of `parts`, `n` and `by_source` is given; or as
+            `split_dataset` and `shorten_dataset`.
+        OutputExists, CannotWrite: as these.
+    """
+    from sart_toolkit.data.combine import shorten_dataset, split_dataset, split_sources
+
+    if (parts is not None) + (n is not None) + by_source != 1:
+        raise InvalidInput("split: expected one of parts, n and by_source; give just one")
+    found = load_dataset(dataset)
+
+    def shown(done: int, total: int) -> None:
+        progress("split", done, total)
+
+    if parts is not None:
+        return split_dataset(found, out, parts, seed, overwrite, shown)
+    if n is not None:
+        return {"": shorten_dataset(found, out, n, overwrite, shown)}
+    return split_sources(found, out, overwrite, shown)
+
+
 @_alone
 def train_policy(
     dataset: Path,

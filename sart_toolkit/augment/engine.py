@@ -48,7 +48,8 @@ class _Worker:
         out: Output,
         config: AugmentConfig,
     ) -> None:
-        self._out, self._files = out.path, EpisodeFiles(out.path)
+        numbers = [source.number for source in sources]
+        self._out, self._files = out.path, EpisodeFiles(out.path, numbers)
         self._backend = make_backend()
         pairs = [(source.demonstration, source.annotation) for source in sources]
         demonstrations = [source.demonstration for source in sources]

@@ -475,6 +475,65 @@ class Validate:
 
 
 @dataclass(frozen=True)
+class Merge:
+    """Make one dataset of several of the same task, robot and cameras.
+
+    Example: sart merge dataset1 dataset2 --out both
+
+    Each part keeps its settings, so that the whole can be validated. Files are linked where the
+    disk can do that. Interrupted, it resumes when the same command is typed again.
+    """
+
+    datasets: Annotated[
+        Positional[tuple[Path, ...]],
+        arg(
+            metavar="DATASET [DATASET ...]",
+            help="Directories from `sart augment`, `merge` or `split`.",
+            help_behavior_hint="",
+        ),
+    ]
+    out: Annotated[Path, arg(help="Directory to write.")]
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Split:
+    """Make datasets of parts of one: for training and validation, smaller, or by demonstration.
+
+    Example: sart split dataset --out parts --parts train=0.8,validation=0.2
+
+    Example: sart split dataset --out small --n 20
+
+    Example: sart split dataset --out each --by-source
+
+    Of each sphere every part gets its share. Interrupted, it resumes when the same command is typed
+    again.
+    """
+
+    dataset: Annotated[
+        Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment` or `merge`.")
+    ]
+    out: Annotated[
+        Path, arg(help="Directory to write; with --n it is the dataset, otherwise OUT/NAME are.")
+    ]
+    parts: Annotated[
+        str | None,
+        _optional(
+            "NAME=FRACTION,...", "Parts by name, with the fraction of the episodes that each gets."
+        ),
+    ] = None
+    n: Annotated[
+        int | None,
+        _optional("INT", "One part of so many trajectories, the demonstrations among them."),
+    ] = None
+    by_source: Annotated[bool, arg(help="A part for each demonstration.")] = False
+    seed: Annotated[int, arg(help="Seed of which episodes the --parts get.")] = 0
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
 class Train:
     """Train a policy on a dataset; interrupted training resumes when typed again.
 
