@@ -69,6 +69,7 @@ from .backends.interface import (
 from .backends.interface import (
     require as require,
 )
+from .backends.raycast import RayCaster as RayCaster
 from .backends.states import (
     pack_state as pack_state,
 )
@@ -263,6 +264,7 @@ from .robots.spec import (
 from .robots.spec import (
     look_at as look_at,
 )
+from .robots.visuals import RobotVisuals as RobotVisuals
 from .scenes.appearance import (
     AppearanceConfig as AppearanceConfig,
 )

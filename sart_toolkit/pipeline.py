@@ -28,6 +28,7 @@ from sart_toolkit.data.records import (
     Annotation,
     Demonstration,
     Rates,
+    Recording,
     Referring,
     library_versions,
 )
@@ -58,6 +59,7 @@ from sart_toolkit.registry import check_known, reference_to
 from sart_toolkit.robots import ROBOTS, get_robot
 from sart_toolkit.robots.spec import check_image_size
 from sart_toolkit.tasks import TASKS, get_task
+from sart_toolkit.workers import Workers
 
 if TYPE_CHECKING:
     from sart_toolkit.augment.config import AugmentConfig
@@ -508,7 +510,7 @@ def augment(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     backend: BackendLike | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Progress = _silent,
     sensor: SensorErrors | None = None,
@@ -522,7 +524,7 @@ def augment(
             needs none.
         out: directory to write; an interrupted generation resumes.
         task, robot, backend: in place of those that the demonstrations note.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: whether `out` may be replaced.
         progress: called with the trajectories kept.
         sensor: with `obstacles` "cloud", what the images may be off by; if left out, what the
@@ -557,7 +559,7 @@ def preview(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     backend: BackendLike | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Progress = _silent,
     sensor: SensorErrors | None = None,
@@ -571,7 +573,7 @@ def preview(
         demo, annotation: as for `augment`.
         out: JSON lines: the settings, then each attempt with its pose and certificate.
         task, robot, backend: in place of those that the demonstrations note.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: whether `out` may be replaced.
         progress: called with the segments proved.
         sensor: as for `augment`.
@@ -825,20 +827,11 @@ def train_policy(
             from (`check_recording`).
         OutputExists, CannotWrite: `out` can't be written.
     """
-    generated = load_dataset(dataset)
-    if policy is None:
-        policy = _policy_for(generated)
-    check_names(policy=policy)
     check_writable(out / "config.json", overwrite)
-    from sart_toolkit.record.checks import check_recording
-
-    for source in generated.sources:
-        # Its robot's limits were compared when the dataset was made; here it need not be found.
-        check_recording(source.demonstration, name=str(source.path))
+    generated, config = _training(dataset, policy, options)
     from sart_toolkit.learn.skill import save_skill
     from sart_toolkit.learn.training import train
 
-    config = _train_config(policy, options)
     if overwrite and (out / "config.json").exists():
         clear_directory(out, "config.json", overwrite=True)
     result = train(
@@ -847,6 +840,61 @@ def train_policy(
     )  # fmt: skip
     save_skill(out, result, generated)
     return config
+
+
+@_alone
+def train_seeds(
+    dataset: Path,
+    out: Path,
+    seeds: Sequence[int],
+    policy: str | type[Policy] | None = None,
+    *,
+    workers: int | Workers = 1,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    **options: Any,
+) -> dict[str, Any]:
+    """A table of the skills trained on a dataset's directory with each seed, in directory `out`.
+
+    Args:
+        dataset: directory from `augment`.
+        out: directory to write: `seed0` and so on, and `sweep.json`; interrupted, it resumes.
+        seeds: what differs.
+        policy: what is trained; what the dataset's strategy is for if left out.
+        workers: how many processes, or `Workers` elsewhere.
+        overwrite: whether a sweep in `out` may be replaced.
+        progress: called with the trainings done.
+        options: of `TrainConfig`, but `seed`; the policy's own where left out or None.
+
+    Raises:
+        MissingFile, BrokenFile, UnknownName, InvalidInput: as `train_policy`.
+        OutputExists, Mismatch, CannotWrite: as `learn.sweep.train_seeds`.
+    """
+    check_writable(out / "sweep.json", overwrite)
+    generated, config = _training(dataset, policy, options)
+    from sart_toolkit.learn import sweep
+
+    return sweep.train_seeds(
+        generated, config, seeds, out, workers, overwrite,
+        lambda done, total: progress("sweep", done, total),
+        lambda done, total, text: progress("train", done, total, text),
+    )  # fmt: skip
+
+
+def _training(
+    dataset: Path, policy: str | type[Policy] | None, options: Mapping[str, Any]
+) -> tuple[Dataset, TrainConfig]:
+    """A dataset that can be learned from, and how."""
+    generated = load_dataset(dataset)
+    if policy is None:
+        policy = _policy_for(generated)
+    check_names(policy=policy)
+    from sart_toolkit.record.checks import check_recording
+
+    for source in generated.sources:
+        # Its robot's limits were compared when the dataset was made; here it need not be found.
+        check_recording(source.demonstration, name=str(source.path))
+    return generated, _train_config(policy, options)
 
 
 def _policy_for(dataset: Dataset) -> str:
@@ -874,7 +922,7 @@ def evaluate(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     backend: BackendLike | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     device: str = "cpu",
     overwrite: bool = False,
     progress: Progress = _silent,
@@ -886,7 +934,7 @@ def evaluate(
         skill: the skill.
         out: JSON file to write; videos go beside it. An interrupted evaluation resumes.
         task, robot, backend: in place of those that the skill notes.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         device: where the policy runs.
         overwrite: whether `out` may be replaced.
         progress: called with the rollouts done.
@@ -963,11 +1011,12 @@ def run(
     episodes: int = 50,
     epochs: int | None = None,
     distribution: Literal["paper", "area"] = "paper",
+    recording: Recording = "reversed",
     cameras: Sequence[str] = ("wrist",),
     image_size: ImageSize = 128,
     seed: int = 0,
     eval_seed: int = 1000,
-    workers: int = 1,
+    workers: int | Workers = 1,
     device: str = "auto",
     overwrite: bool = False,
     command: str = "sart_toolkit.run",
@@ -992,11 +1041,12 @@ def run(
         episodes: rollouts with random placements.
         epochs: of training, the policy's own if None.
         distribution: how positions are drawn on a sphere.
+        recording: whether segments are recorded on the way out and reversed, or on the return.
         cameras: whose images are recorded and trained on.
         image_size: width and height of recorded images [pixels]; one number for a square.
         seed: of all that is random, except evaluation.
         eval_seed: of the placements that are evaluated.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         device: where training and the policy run: "auto", "cpu" or "cuda".
         overwrite: whether a run in `out` may be replaced.
         command: how it was asked for, kept with the run.
@@ -1029,6 +1079,7 @@ def run(
     get_backend(backend)
     generation: dict[str, Any] = {
         "n": n, "strategy": strategy, "sampling": SamplingConfig(distribution), "seed": seed,
+        "recording": recording,
     }  # fmt: skip
     drawn = AugmentConfig(**generation)
     training: dict[str, Any] = {
@@ -1051,6 +1102,7 @@ def run(
         "cameras": list(cameras),
         "image_size": list(size),
         "distribution": distribution,
+        "recording": recording,
         "epochs": epochs,
         "device": device,
     }

@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from sart_toolkit import doctor
 from sart_toolkit.annotate.session import AnnotationSession
@@ -38,7 +39,7 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.preview import preview_sources
 from sart_toolkit.backends import BACKENDS, get_backend, make_backend
-from sart_toolkit.backends.interface import Backend, BackendFactory, Resets, require
+from sart_toolkit.backends.interface import Backend, BackendFactory, Draws, Resets, require
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.cloud import fuse_cloud
 from sart_toolkit.collision.exact import ExactWorld
@@ -77,7 +78,9 @@ from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scenes.spec import SceneSpec
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.robots.visuals import shape_mesh
+from sart_toolkit.scenes.spec import SceneSpec, SceneState
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.testing.closest import ClosestPoints
@@ -1045,6 +1048,98 @@ def _drive(backend: Backend, task: Task, seed: int) -> tuple[float, float]:
         physics.append(time.perf_counter() - started)
 
 
+# --- images -------------------------------------------------------------------------------------
+
+
+def bench_draw(arguments: Sequence[str]) -> dict[str, Any]:
+    """Milliseconds of an RGB-D image by the wrist camera at the task's start, by task and renderer.
+
+    Rays, as the PyBullet backend draws; PyBullet's own TinyRenderer, called directly on the same
+    meshes; SAPIEN, where it can draw. Images of all alternate, one thread.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py draw", description=bench_draw.__doc__)
+    parser.add_argument("--tasks", default="all", help=f"all, or {','.join(TASKS)}")
+    parser.add_argument("--image-size", type=int, default=128, help="[pixels]")
+    parser.add_argument("--repeats", type=int, default=40, help="images of each, for the median")
+    options = parser.parse_args(arguments)
+    check_positive("--repeats", options.repeats)
+    size = options.image_size
+    figures: dict[str, Any] = {}
+    for name in list(TASKS) if options.tasks == "all" else options.tasks.split(","):
+        task = get_task(name)
+        robot = get_robot(task.robot)
+        state = task.initial_state(RobotModel(robot, task.scene.held), Placement())
+        opened = {kind: make_backend(kind, robot, task.scene, size) for kind in BACKENDS}
+        drawing = {kind: b for kind, b in opened.items() if not b.no_images}
+        renderers: dict[str, Callable[[], Any]] = {
+            {"pybullet": "rays"}.get(kind, kind): functools.partial(
+                require(backend, Draws, "it is measured").draw,
+                *(state, backend.cameras["wrist"], size, size),
+            )
+            for kind, backend in drawing.items()
+        }
+        renderers["tiny_renderer"] = _tiny_renderer(robot, task.scene, state, size)
+        seconds: dict[str, list[float]] = {kind: [] for kind in renderers}
+        for turn in range(options.repeats + 1):
+            for kind, draw in renderers.items():
+                taken = _timed(draw)[1]
+                # The first reads meshes.
+                if turn:
+                    seconds[kind].append(taken)
+        for backend in opened.values():
+            backend.close()
+        figures[name] = {kind: 1e3 * statistics.median(each) for kind, each in seconds.items()}
+        _say(f"{name}: " + ", ".join(f"{k} {v:.1f} ms" for k, v in figures[name].items()))
+    return {"image_size": size, "repeats": options.repeats, "image_ms": figures}
+
+
+def _tiny_renderer(
+    robot: RobotSpec, scene: SceneSpec, state: SceneState, size: int
+) -> Callable[[], Any]:
+    """What has PyBullet's TinyRenderer draw a state by the wrist camera."""
+    import pybullet as p
+    from pybullet_utils.bullet_client import BulletClient
+
+    model = RobotModel(robot, scene.held)
+    client: Any = BulletClient(p.DIRECT)
+    arm = client.loadURDF(str(model.urdf), useFixedBase=True)
+    positions = dict(zip(robot.arm_joints, state.q, strict=True))
+    positions |= robot.gripper.joint_positions(state.gripper)
+    for joint in range(client.getNumJoints(arm)):
+        name = client.getJointInfo(arm, joint)[1].decode()
+        client.resetJointState(arm, joint, positions.get(name, 0.0))
+    for body in scene.bodies:
+        for shape in body.shapes:
+            mesh = shape_mesh(shape)
+            T = state.Ts_world_body[body.name]
+            drawn = client.createVisualShape(
+                p.GEOM_MESH,
+                vertices=mesh.vertices.tolist(),
+                indices=mesh.triangles.ravel().tolist(),
+                rgbaColor=shape.rgba,
+            )
+            at, turned = T[:3, 3].tolist(), Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+            client.createMultiBody(0, -1, drawn, at, turned)
+    camera = next(camera for camera in robot.cameras if camera.name == "wrist")
+    T_world_camera = model.fk(state.q, camera.frame) @ camera.T_frame_camera
+    # OpenGL's camera looks along -z with y up.
+    view = inverse(T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    projection = p.computeProjectionMatrixFOV(camera.fov_y_deg, 1.0, camera.near, camera.far)
+
+    def draw() -> Any:
+        return client.getCameraImage(
+            size,
+            size,
+            view.T.ravel().tolist(),
+            projection,
+            shadow=0,
+            flags=p.ER_NO_SEGMENTATION_MASK,
+            renderer=p.ER_TINY_RENDERER,
+        )
+
+    return draw
+
+
 # --- the annotator ------------------------------------------------------------------------------
 
 # As a person would go: step, add, try radii, jump on, suggest, remove, undo.
@@ -1190,6 +1285,7 @@ BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "augment": bench_augment,
     "certificate": bench_certificate,
     "dataset": bench_dataset,
+    "draw": bench_draw,
     "plan": bench_plan,
     "step": bench_step,
     "storage": bench_storage,

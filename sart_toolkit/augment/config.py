@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sart_toolkit.augment.strategies import Strategy
 from sart_toolkit.collision import SOURCES, Source
 from sart_toolkit.collision.phases import IN_GRASP_SLIP
 from sart_toolkit.collision.sensor import CloudConfig
+from sart_toolkit.data.records import Recording
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
@@ -34,8 +35,10 @@ class AugmentConfig:
     measured, even if what is grasped has slipped by `slip_tolerance` [m] and bodies have moved by
     `BODY_STILLNESS`; as commanded, even if the robot is off its path by its backend's
     `tracking_error` besides. A segment on which any of these was exceeded is rejected. `cameras`:
-    whose images are recorded, `None` for those of the demonstration. `executor`: how segments are
-    executed.
+    whose images are recorded, `None` for those of the demonstration. `execution`: how segments are
+    executed, "auto" for whichever executor the backend and the demonstrations allow. `recording`:
+    "reversed" records the way out and reverses it, as the paper does; "return" records the way
+    back, so that the robot lags behind its commands as it will when a policy acts.
     `strategy` may be given as an object; its reference is kept.
     """
 
@@ -50,7 +53,8 @@ class AugmentConfig:
     cloud: CloudConfig = field(default_factory=CloudConfig)
     seed: int = 0
     cameras: tuple[str, ...] | None = None
-    executor: str = "restore"
+    execution: str = "auto"
+    recording: Recording = "reversed"
 
     def __post_init__(self) -> None:
         least = 2 if get_strategy(self.strategy).draws else 1
@@ -64,6 +68,8 @@ class AugmentConfig:
             raise unknown_name("allocation", self.allocation, ALLOCATIONS)
         if self.obstacles not in SOURCES:
             raise unknown_name("obstacles", self.obstacles, SOURCES)
+        if self.recording not in get_args(Recording):
+            raise unknown_name("recording", self.recording, get_args(Recording))
         check_positive("duration", self.duration, "s")
         for name in ("margin", "slip_tolerance"):
             value = getattr(self, name)

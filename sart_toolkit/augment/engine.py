@@ -20,17 +20,22 @@ from sart_toolkit.data.manifest import AttemptKey, EpisodeEntry, Rejection
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles, SphereShare, check_sources
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
+from sart_toolkit.workers.parcels import Output
 
 _log = logging.getLogger(__name__)
 
 
 class _Result(NamedTuple):
-    """What came of an attempt, small enough to go from one process to another."""
+    """What came of an attempt, small enough to go from one process to another.
+
+    `file`: where the kept episode is written.
+    """
 
     key: AttemptKey
     entry: EpisodeEntry | None
     rejection: Rejection
+    file: Path | None
 
 
 class _Worker:
@@ -40,23 +45,27 @@ class _Worker:
         self,
         make_backend: BackendFactory,
         sources: Sequence[Source],
-        files: EpisodeFiles,
+        out: Output,
         config: AugmentConfig,
     ) -> None:
-        self._files = files
+        numbers = [source.number for source in sources]
+        self._out, self._files = out.path, EpisodeFiles(out.path, numbers)
         self._backend = make_backend()
         pairs = [(source.demonstration, source.annotation) for source in sources]
-        self._executor = get_executor(config.executor)(self._backend, pairs, config)
+        demonstrations = [source.demonstration for source in sources]
+        executor = get_executor(config.execution, self._backend, demonstrations)
+        self._executor = executor(self._backend, pairs, config)
 
     def results(self, keys: Iterable[AttemptKey]) -> Iterator[_Result]:
         """The results of attempts, one after the other, in the executor's order."""
         for attempt in self._executor.attempts(keys):
             episode = attempt.episode
-            entry = None
+            entry = file = None
             if episode is not None:
                 entry = dataclasses.replace(self._files.write(episode), seconds=attempt.seconds)
+                file = self._out / entry.name
             rejection = Rejection(attempt.outcome, attempt.detail, attempt.seconds)
-            yield _Result(attempt.key, entry, rejection)
+            yield _Result(attempt.key, entry, rejection, file)
 
     def __call__(self, key: AttemptKey) -> _Result:
         (result,) = self.results([key])
@@ -72,7 +81,7 @@ def augment_demonstration(
     make_backend: BackendFactory,
     out: Path,
     config: AugmentConfig | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
 ) -> Dataset:
@@ -86,7 +95,7 @@ def augment_sources(
     make_backend: BackendFactory,
     out: Path,
     config: AugmentConfig | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
 ) -> Dataset:
@@ -102,7 +111,7 @@ def augment_sources(
         make_backend: makes the robot in the demonstrations' scene; picklable if `workers` > 1.
         out: directory to write.
         config: what to generate.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: replace what is in `out`.
         progress: called with (kept, wanted, rejected) after each attempt.
 
@@ -120,15 +129,18 @@ def augment_sources(
     config = config or AugmentConfig()
     # All that can be refused is refused before anything is replaced.
     check_sources(sources)
-    executor = get_executor(config.executor)
-    if workers < 1:
-        raise InvalidInput(f"workers: expected at least 1, got {workers}")
-    if workers > 1 and not executor.parallel:
-        raise InvalidInput(f"workers: executor {config.executor!r} needs 1 process, got {workers}")
+    workers = Workers.of(workers)
+    demonstrations = [demonstration for demonstration, _ in sources]
     allocation = Allocation(sources, config)
     with closing(make_backend()) as backend:
+        executor = get_executor(config.execution, backend, demonstrations)
+        if not workers.here and not executor.parallel:
+            raise InvalidInput(
+                f"workers: execution {config.execution!r} needs 1 process, got {workers.count} of "
+                f"executor {workers.executor!r}"
+            )
         if allocation.shares:
-            executor.check(backend, [demonstration for demonstration, _ in sources], config)
+            executor.check(backend, demonstrations, config)
         request = _request(backend, config)
     started = time.perf_counter()
     with DatasetWriter(out, sources, request, overwrite) as writer:
@@ -137,10 +149,12 @@ def augment_sources(
 
         resumed = writer.n_kept + writer.n_rejected > 0
 
-        make_worker = functools.partial(_Worker, make_backend, writer.sources, writer.files, config)
+        make_worker = functools.partial(
+            _Worker, make_backend, writer.sources, Output(writer.path), config
+        )
         with _results(make_worker, workers) as results:
             while keys := allocation.missing(writer.tally):
-                for key, entry, rejection in results(keys):
+                for key, entry, rejection, _ in results(keys):
                     if entry is None:
                         writer.reject(key, rejection)
                     else:
@@ -163,14 +177,14 @@ def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
 
 @contextmanager
 def _results(
-    make_worker: Callable[[], _Worker], processes: int
+    make_worker: Callable[[], _Worker], workers: Workers
 ) -> Iterator[Callable[[Iterable[AttemptKey]], Iterator[_Result]]]:
     """A function that makes attempts; a single process makes them in its executor's order."""
-    if processes == 1:
+    if workers.here:
         with closing(make_worker()) as worker:
             yield worker.results
     else:
-        with worker_map(make_worker, processes) as run:
+        with worker_map(make_worker, workers) as run:
             yield run
 
 

@@ -20,7 +20,7 @@ from sart_toolkit.data.writer import Sources, check_sources
 from sart_toolkit.errors import MotionRejected, Unreachable
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
 
 PROVED = "proved"
 _MOST_AT_ONCE, _FEWEST_BATCHES = 16, 32
@@ -111,7 +111,7 @@ def preview_sources(
     tracking_error: float,
     out: Path,
     config: AugmentConfig | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
 ) -> Preview:
@@ -134,7 +134,7 @@ def preview_sources(
             backend that is to execute the segments declares it.
         out: file to write.
         config: what to plan.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: replace what is at `out`.
         progress: called with (proved, wanted, rejected) after each attempt.
 

@@ -1,4 +1,4 @@
-"""Checks a dataset again: content, certificates and reversals of every episode, from scratch."""
+"""Checks a dataset again: content, certificates and course of every episode, from scratch."""
 
 from __future__ import annotations
 
@@ -61,9 +61,10 @@ def validate_dataset(
 
     For each episode: the file's content hash; that seed, sphere and k lead to its sampled pose; the
     certificates of the joint path commanded and of the one measured; that what it commands is that
-    path backwards, and what it measured the measured path backwards; that every commanded pose
-    followed by its action gives the next one, also across the join. For the dataset: that it holds
-    the demonstrations and the episodes that it lists. One episode is in memory at a time.
+    path backwards, and what it measured the measured path, backwards where it was reversed; that
+    every commanded pose followed by its action gives the next one, also across the join. For the
+    dataset: that it holds the demonstrations and the episodes that it lists. One episode is in
+    memory at a time.
 
     Args:
         path: directory from `sart augment`.
@@ -132,9 +133,16 @@ class _EpisodeCheck:
         source, config = self._sources[entry.source], self._configs[entry.source]
         if (p.source, p.sphere, p.k) != (source.number, entry.sphere, entry.k):
             raise MotionRejected("provenance: it is of another attempt than the index says")
-        made_with = (config.seed, config.strategy, config.sampling.distribution)
-        if (p.seed, p.strategy, p.distribution) != made_with:
-            raise MotionRejected("provenance: made with another seed, strategy or distribution")
+        made_with = (
+            config.seed,
+            config.strategy,
+            config.sampling.distribution,
+            config.recording,
+        )
+        if (p.seed, p.strategy, p.distribution, p.recording) != made_with:
+            raise MotionRejected(
+                "provenance: made with another seed, strategy, distribution or recording"
+            )
         planner = self._planners[entry.source]
         proposal, rng = planner.proposal(p.sphere, p.k)
         far = np.abs(proposal.T_world_sampled - p.T_world_sampled).max()
@@ -168,7 +176,7 @@ class _EpisodeCheck:
             )
         self.largest_deviation = max(self.largest_deviation, deviation)
         demonstration = source.demonstration
-        _check_reversal(episode, motion, planner.world.kinematics, demonstration.rates.record_hz)
+        _check_course(episode, motion, planner.world.kinematics, demonstration.rates.record_hz)
         _check_actions(episode, demonstration)
 
     def _compare(self, stated: Mapping[str, Any], which: str, found: Certificate) -> None:
@@ -194,24 +202,27 @@ def _stated_length(proof: Mapping[str, Any], name: str) -> float:
     return float(value)
 
 
-def _check_reversal(episode: Episode, motion: Motion, model: RobotModel, record_hz: int) -> None:
-    """Return if an episode commands a motion backwards, and measured its joint path backwards."""
+def _check_course(episode: Episode, motion: Motion, model: RobotModel, record_hz: int) -> None:
+    """Return if an episode commands a motion backwards, and measured what its joint path has."""
     steps = episode.steps
     times = motion.times(record_hz)
     if len(times) != len(steps):
-        raise MotionRejected(f"reversal: {len(steps)} steps, the motion has {len(times)}")
+        raise MotionRejected(f"course: {len(steps)} steps, the motion has {len(times)}")
     outwards = steps.commanded_joint_positions[::-1]
     if np.abs(outwards - motion.joints(times)).max() > _JOINT_TOLERANCE:
-        raise MotionRejected("reversal: the commanded joints aren't the planned path backwards")
+        raise MotionRejected("course: the commanded joints aren't the planned path backwards")
     poses = steps.commanded_Ts_world_tool[::-1]
     planned = np.array([motion.T_world_tool(time) for time in times])
     if np.abs(poses - planned).max() > _POSE_TOLERANCE:
-        raise MotionRejected("reversal: the commanded poses aren't the planned line backwards")
-    if not _in_order(steps.joint_positions[::-1], episode.joint_path):
-        raise MotionRejected("reversal: the measured joints aren't the measured path backwards")
+        raise MotionRejected("course: the commanded poses aren't the planned line backwards")
+    if episode.provenance.recording == "reversed":
+        if not _in_order(steps.joint_positions[::-1], episode.joint_path):
+            raise MotionRejected("course: the measured joints aren't the measured path backwards")
+    elif not _in_order(steps.joint_positions, episode.joint_path):
+        raise MotionRejected("course: the measured joints aren't those of the measured path")
     measured = np.array([model.fk(q) for q in steps.joint_positions])
     if np.abs(measured - steps.measured_Ts_world_tool).max() > 100 * _POSE_TOLERANCE:
-        raise MotionRejected("reversal: measured tool poses and joints don't belong together")
+        raise MotionRejected("course: measured tool poses and joints don't belong together")
 
 
 def _in_order(rows: Array, path: Array) -> bool:

@@ -11,6 +11,7 @@ from sart_toolkit.cli.arguments import Augment, Validate
 from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
+from sart_toolkit.cli.workers import chosen_workers
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.errors import InvalidInput, Mismatch
 
@@ -26,7 +27,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
         "task": args.task,
         "robot": args.robot,
         "backend": args.backend,
-        "workers": args.workers,
+        "workers": chosen_workers(args),
         "overwrite": args.overwrite,
         "sensor": sensor,
         **({} if args.n is None else {"n": args.n}),
@@ -34,6 +35,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
         "strategy": args.strategy,
         "sampling": SamplingConfig(args.distribution, args.rotation_per_metre),
         "duration": args.duration,
+        "recording": args.recording,
         "margin": args.margin,
         "slip_tolerance": args.slip_tolerance,
         "obstacles": args.source,

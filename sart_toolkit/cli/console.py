@@ -23,6 +23,7 @@ _UNITS = {
     "validate": "episode",
     "read": "trajectory",
     "train": "step",
+    "sweep": "training",
     "evaluate": "rollout",
     "operator": "episode",
     "replay": "replay",

@@ -33,6 +33,7 @@ DepthImage = NDArray[np.float32]
 ACTION_SIZE = 7
 CameraFrame = Literal["tool", "world"]
 Judge = Literal["task", "person", "nobody"]
+Recording = Literal["reversed", "return"]
 # nu_r [rad/m]: rotation drawn per metre of radius, the published code's value.
 ROTATION_PER_METRE = 2.0
 
@@ -507,7 +508,8 @@ class Provenance:
 
     `source` is the number of its demonstration in the dataset, `sphere` that of its sphere among
     those that its strategy draws from there, `k` that of the attempt from the sphere. `merged`:
-    whether the demonstration follows from `t_star` on.
+    whether the demonstration follows from `t_star` on. `recording`: whether the segment's steps
+    were recorded on the way out and reversed, or on the return.
     """
 
     demonstration_hash: str
@@ -521,6 +523,7 @@ class Provenance:
     distribution: str
     certificate: Mapping[str, Any] | None = None
     merged: bool = True
+    recording: Recording = "reversed"
 
     def __post_init__(self) -> None:
         sampled = check_pose("T_world_sampled", self.T_world_sampled)
@@ -529,12 +532,13 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Episode:
-    """One generated trajectory: the reversed segment's steps, then the demonstration from `t_star`.
+    """One generated trajectory: the segment's steps to t*, then the demonstration from `t_star`.
 
     The segment's last step is followed by the demonstration's step `provenance.t_star`; that
     suffix is stored once, in the demonstration. Where `provenance.merged` is false the trajectory
-    ends there. `joint_path (m, n)` [rad]: the joints as they were
-    measured while the segment was executed, from t* outwards, at the backend's own rate.
+    ends there. `joint_path (m, n)` [rad]: the joints as they were measured while the segment was
+    executed, from t* outwards, and back again where the return was recorded, at the backend's own
+    rate.
     """
 
     steps: Steps

@@ -7,7 +7,8 @@ import pytest
 
 from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.executors import DisturbanceCheck, RestoreExecutor
+from sart_toolkit.augment.execution import DisturbanceCheck
+from sart_toolkit.augment.executors import RestoreExecutor
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.backends.interface import Observation
 from sart_toolkit.collision.exact import ExactWorld

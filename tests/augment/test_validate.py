@@ -169,7 +169,8 @@ def steps(**changes):
     ("tamper", "message"),
     [
         (provenance(k=17), "it is of another attempt than the index says"),
-        (provenance(seed=5), "another seed, strategy or distribution"),
+        (provenance(seed=5), "another seed, strategy, distribution or recording"),
+        (provenance(recording="return"), "another seed, strategy, distribution or recording"),
         (provenance(t_star=3), "lead to another pose or waypoint"),
         (provenance(demonstration_hash="0" * 64), "was generated from another demonstration"),
         (provenance(certificate=None), "certificate: there is none"),
@@ -196,6 +197,19 @@ def test_whatever_is_changed_is_reported_though_all_hashes_fit(copy, validate, t
     assert re.search(message, validate(copy).problems[name])
 
 
+def test_a_return_whose_measured_steps_are_not_those_of_its_measured_path_is_reported(
+    peg_demonstration, peg_annotation, make_peg_backend, validate, tmp_path
+):
+    out, config = tmp_path / "dataset", AugmentConfig(n=2, recording="return")
+    dataset = augment_demonstration(
+        peg_demonstration, peg_annotation, make_peg_backend, out, config
+    )
+    q = np.array(dataset.episode(0).steps.joint_positions)
+    q[5] += 1e-4
+    name = change(out, steps=with_steps(dataset.episode(0), joint_positions=q))
+    assert "measured joints aren't those of the measured path" in validate(out).problems[name]
+
+
 def test_an_episode_with_a_step_too_few_is_reported(copy, validate):
     episode = load_dataset(copy).episode(0)
     shorter = {
@@ -204,7 +218,7 @@ def test_an_episode_with_a_step_too_few_is_reported(copy, validate):
         if f.name != "cameras"
     }
     name = change(copy, steps=Steps(cameras={}, **shorter))
-    assert "reversal: 19 steps, the motion has 20" in validate(copy).problems[name]
+    assert "course: 19 steps, the motion has 20" in validate(copy).problems[name]
 
 
 def test_what_is_no_dataset_is_refused(copy, validate, tmp_path):

@@ -61,6 +61,17 @@ def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
     assert "turn 1/1" in err
 
 
+def test_the_drawing_benchmark_measures_each_renderer(capsys):
+    arguments = "draw --tasks lid_closing --image-size 16 --repeats 2"
+    assert bench.main(arguments.split()) == 0
+    out, err = capsys.readouterr()
+    figures = json.loads(out.splitlines()[-1])["figures"]
+    milliseconds = figures["image_ms"]["lid_closing"]
+    assert {"rays", "tiny_renderer"} <= set(milliseconds) <= {"rays", "tiny_renderer", "sapien"}
+    assert all(value > 0 for value in milliseconds.values())
+    assert "lid_closing: rays" in err
+
+
 def test_the_planning_benchmark_counts_what_is_proved(capsys):
     assert bench.main(["plan", "--tasks", "peg_in_hole", "--n", "30", "--repeats", "1"]) == 0
     out, err = capsys.readouterr()
