@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.executors import get_executor
+from sart_toolkit.augment.executors import Spare, get_executor, no_spare
 from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.data.dataset import Dataset, Source
 from sart_toolkit.data.manifest import AttemptKey, EpisodeEntry, Rejection
@@ -32,6 +32,7 @@ class _Result(NamedTuple):
     key: AttemptKey
     entry: EpisodeEntry | None
     rejection: Rejection
+    resets: int
 
 
 class _Worker:
@@ -43,23 +44,24 @@ class _Worker:
         sources: Sequence[Source],
         files: EpisodeFiles,
         config: AugmentConfig,
+        ask: Callable[[str], None] | None,
     ) -> None:
         self._files = files
         self._backend = make_backend()
         pairs = [(source.demonstration, source.annotation) for source in sources]
         demonstrations = [source.demonstration for source in sources]
         executor = get_executor(config.execution, self._backend, demonstrations)
-        self._executor = executor(self._backend, pairs, config)
+        self._executor = executor(self._backend, pairs, config, ask)
 
-    def results(self, keys: Iterable[AttemptKey]) -> Iterator[_Result]:
+    def results(self, keys: Iterable[AttemptKey], spare: Spare = no_spare) -> Iterator[_Result]:
         """The results of attempts, one after the other, in the executor's order."""
-        for attempt in self._executor.attempts(keys):
+        for attempt in self._executor.attempts(keys, spare):
             episode = attempt.episode
             entry = None
             if episode is not None:
                 entry = dataclasses.replace(self._files.write(episode), seconds=attempt.seconds)
             rejection = Rejection(attempt.outcome, attempt.detail, attempt.seconds)
-            yield _Result(attempt.key, entry, rejection)
+            yield _Result(attempt.key, entry, rejection, attempt.resets)
 
     def __call__(self, key: AttemptKey) -> _Result:
         (result,) = self.results([key])
@@ -78,10 +80,11 @@ def augment_demonstration(
     workers: int = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
+    ask: Callable[[str], None] | None = None,
 ) -> Dataset:
     """Generate a dataset directory from one demonstration: `augment_sources` of that alone."""
     sources = [(demonstration, annotation)]
-    return augment_sources(sources, make_backend, out, config, workers, overwrite, progress)
+    return augment_sources(sources, make_backend, out, config, workers, overwrite, progress, ask)
 
 
 def augment_sources(
@@ -92,6 +95,7 @@ def augment_sources(
     workers: int = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
+    ask: Callable[[str], None] | None = None,
 ) -> Dataset:
     """Generate a dataset directory from demonstrations of one task and their annotations.
 
@@ -107,6 +111,7 @@ def augment_sources(
         workers: processes.
         overwrite: replace what is in `out`.
         progress: called with (kept, wanted, rejected) after each attempt.
+        ask: where the robot can't be reset: shows a person what to do, returns when it is done.
 
     Raises:
         Mismatch: an annotation belongs to another demonstration, the demonstrations to different
@@ -137,7 +142,7 @@ def augment_sources(
             raise InvalidInput(
                 f"workers: executor {config.execution!r} needs 1 process, got {workers}"
             )
-        executor.check(backend, demonstrations, config)
+        executor.check(backend, demonstrations, config, ask)
         request = _request(backend, config)
     started = time.perf_counter()
     with DatasetWriter(out, sources, request, overwrite) as writer:
@@ -146,27 +151,46 @@ def augment_sources(
 
         resumed = writer.n_kept + writer.n_rejected > 0
 
-        def missing() -> list[AttemptKey]:
-            """The attempts still needed, no more than can all be kept."""
-            keys: list[AttemptKey] = []
-            for (source, sphere, _), quota in zip(spheres, quotas, strict=True):
-                limit = max(_LEAST_ATTEMPTS, _ATTEMPTS_PER_EPISODE * quota)
-                keys += writer.missing(source, sphere, quota, limit)
+        wanted = {
+            (source, sphere): quota
+            for (source, sphere, _), quota in zip(spheres, quotas, strict=True)
+        }
+
+        def missing(source: int, sphere: int) -> list[AttemptKey]:
+            """The attempts still needed from a sphere, no more than can all be kept."""
+            quota = wanted[source, sphere]
+            limit = max(_LEAST_ATTEMPTS, _ATTEMPTS_PER_EPISODE * quota)
+            return writer.missing(source, sphere, quota, limit)
+
+        def all_missing() -> list[AttemptKey]:
+            keys = [key for sphere in wanted for key in missing(*sphere)]
             return sorted(keys, key=lambda key: (key.k, key.source, key.sphere))
 
-        make_worker = functools.partial(_Worker, make_backend, writer.sources, writer.files, config)
+        def spare(source: int, sphere: int) -> AttemptKey | None:
+            """One more attempt from a sphere, if those under way can't be enough."""
+            further = [key for key in missing(source, sphere) if key not in given]
+            given.update(further[:1])
+            return further[0] if further else None
+
+        resets = 0
+        make_worker = functools.partial(
+            _Worker, make_backend, writer.sources, writer.files, config, ask
+        )
         with _results(make_worker, workers) as results:
-            while keys := missing():
-                for key, entry, rejection in results(keys):
+            while keys := all_missing():
+                given = set(keys)
+                for key, entry, rejection, reset in results(keys, spare):
+                    resets += reset
                     if entry is None:
                         writer.reject(key, rejection)
                     else:
                         writer.keep(entry)
                     if progress is not None:
                         progress(writer.n_kept, sum(quotas), writer.n_rejected)
-        # How long an interrupted generation took in all is not known.
+        # How long an interrupted generation took in all, with how many resets, is not known.
         seconds = None if resumed else time.perf_counter() - started
-        return _finish(writer, sources[0][0], config, sum(quotas), seconds)
+        counted = None if resumed else resets
+        return _finish(writer, sources[0][0], config, sum(quotas), seconds, counted)
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
@@ -181,14 +205,14 @@ def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
 @contextmanager
 def _results(
     make_worker: Callable[[], _Worker], processes: int
-) -> Iterator[Callable[[Iterable[AttemptKey]], Iterator[_Result]]]:
+) -> Iterator[Callable[[Iterable[AttemptKey], Spare], Iterator[_Result]]]:
     """A function that makes attempts; a single process makes them in its executor's order."""
     if processes == 1:
         with closing(make_worker()) as worker:
             yield worker.results
     else:
         with worker_map(make_worker, processes) as run:
-            yield run
+            yield lambda keys, spare: run(keys)
 
 
 def _finish(
@@ -197,6 +221,7 @@ def _finish(
     config: AugmentConfig,
     wanted: int,
     seconds: float | None,
+    resets: int | None,
 ) -> Dataset:
     attempted = writer.n_kept + writer.n_rejected
     reasons = ", ".join(f"{reason}: {count}" for reason, count in writer.rejections.items())
@@ -214,6 +239,7 @@ def _finish(
             "robot": demonstration.robot,
             "seconds": seconds,
             "simulated_seconds": writer.executed_seconds,
+            "resets": resets,
             "config": config.to_json(),
             "references": dict(demonstration.references),
         }

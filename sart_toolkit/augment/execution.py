@@ -28,8 +28,15 @@ from sart_toolkit.poses import Array, inverse
 from sart_toolkit.record.recorder import StepRecorder
 from sart_toolkit.scenes.spec import SceneSpec
 
+# How far [m] bodies may be from where they were on a way out and back, which takes twice as long:
+# what rests on a table creeps by 0.02 mm/s in PyBullet.
+OUT_AND_BACK_STILLNESS = 2 * BODY_STILLNESS
 # At rest, no joint is faster [rad/s]; how long [s] the robot has for it.
 _REST_SPEED, _LONGEST_REST = 0.01, 2.0
+# Where only the force is sensed, by how much [N] more than at the start means a contact.
+_MORE_FORCE = 5.0
+# How soon [s] the robot stands still where something stopped it, and is at speed on its way back.
+_STOP, _START = 0.1, 0.3
 
 
 class SegmentRun:
@@ -43,9 +50,17 @@ class SegmentRun:
     """
 
     def __init__(
-        self, backend: Backend, planner: SegmentPlanner, t: int, config: AugmentConfig
+        self,
+        backend: Backend,
+        planner: SegmentPlanner,
+        t: int,
+        config: AugmentConfig,
+        stillness: float = BODY_STILLNESS,
     ) -> None:
-        """Begin where the robot is: at waypoint `t`, the command of that waypoint in force."""
+        """Begin where the robot is: at waypoint `t`, the command of that waypoint in force.
+
+        Bodies may be up to `stillness` [m] from where the demonstration has them.
+        """
         world = planner.world
         steps = world.demonstration.steps
         self._backend, self._rates, self._recording = backend, backend.rates, config.recording
@@ -57,10 +72,14 @@ class SegmentRun:
         self._recorder = StepRecorder(backend, world.kinematics, cameras)
         # What was measured last at the end of a recorded step.
         self._step_end = start = backend.observe()
-        self._disturbance = DisturbanceCheck(backend.scene, world, t, start, config)
+        self._disturbance = DisturbanceCheck(backend.scene, world, t, start, config, stillness)
         self._measured = [start.q[None]]
         self._no_force = 0.0 if isinstance(backend, SensesForce) else np.nan
         self._pressed = self._no_force
+        # Greatest force of the first period.
+        self._force_before: float | None = None
+        # Where in a motion's time [s] the robot was sent last.
+        self._at = 0.0
         self.periods = 0
 
     @property
@@ -118,6 +137,26 @@ class SegmentRun:
             self._step_end = self._record()
         self._follow(motion, backwards=True, rows=rows)
 
+    def retreat(self, motion: Motion) -> None:
+        """Stop on the way out, and go back along the motion's path to the waypoint; check nothing.
+
+        The motion's time slows down and runs back, so that the robot stays on its path.
+        """
+        steps = np.arange(1, 1 + round(_STOP * self._rates.physics_hz))
+        u = steps / len(steps)
+        stopping = self._at + _STOP * (u - _ramp(u))
+        back = np.arange(1, 1 + round((self._at + _STOP + _START) * self._rates.physics_hz))
+        u = back / (_START * self._rates.physics_hz)
+        returning = stopping[-1] - _START * (_ramp(np.minimum(u, 1.0)) + np.maximum(u - 1.0, 0.0))
+        times = np.maximum(np.concatenate([stopping, returning]), 0.0)
+        # Whole control periods; it rests at the waypoint by then.
+        missing = -len(times) % self._rates.physics_per_control
+        times = np.concatenate([times, np.zeros(missing)])
+        for targets in self._periods(motion.joints(times)):
+            self._backend.command(targets, self._gripper)
+            self._backend.step()
+            self.periods += 1
+
     def _times(self, motion: Motion) -> Array:
         return motion.times(self._rates.record_hz)
 
@@ -137,7 +176,10 @@ class SegmentRun:
         per_record = self._rates.control_per_record
         for i, (time, wanted, now) in enumerate(zip(times, targets, sent, strict=False), 1):
             # As a policy will be at its own rate, held to what was measured a recorded step ago.
-            self._controller.follow(wanted, motion.T_world_tool(time), self._step_end.T_world_tool)
+            self._controller.follow(
+                wanted, motion.T_world_tool(time), self._step_end.T_world_tool, now[-1]
+            )
+            self._at = time
             self._send(now)
             if i % per_record:
                 self._measure()
@@ -181,6 +223,17 @@ class SegmentRun:
             self._pressed = max(self._pressed, backend.force())
         if isinstance(backend, SensesContacts):
             check_untouched(backend.scene, backend.contacts(), self._grasped)
+        elif isinstance(backend, SensesForce):
+            self._check_force(backend.force())
+
+    def _check_force(self, force: float) -> None:
+        if self._force_before is None:
+            self._force_before = force
+        if not force - self._force_before <= _MORE_FORCE:
+            raise MotionRejected(
+                f"contact force: {force:.1f} N, {self._force_before:.1f} N before it moved; "
+                "stopped there"
+            )
 
     def _measure(self) -> Observation:
         return self._checked(self._backend.observe())
@@ -196,6 +249,11 @@ class SegmentRun:
         return seen
 
 
+def _ramp(u: Array) -> Array:
+    """How far a speed takes that rises from 0 at u = 0 smoothly to 1 at u = 1; then it is 1 / 2."""
+    return np.asarray(u**6 - 3 * u**5 + 2.5 * u**4)
+
+
 def segment_proof(
     planner: SegmentPlanner,
     t: int,
@@ -203,6 +261,7 @@ def segment_proof(
     certificate: Certificate,
     joint_path: Array,
     backend: Backend,
+    stillness: float = BODY_STILLNESS,
 ) -> dict[str, Any]:
     """What is proved about a segment: of the path commanded, and of the one measured.
 
@@ -213,6 +272,7 @@ def segment_proof(
         certificate: the proof of that.
         joint_path: the joints `(m, n)` [rad] as measured.
         backend: what executed it.
+        stillness: how far [m] bodies may have been from where the demonstration has them.
 
     Raises:
         MotionRejected: the measured path is farther off than the backend's tracking error, or
@@ -228,7 +288,7 @@ def segment_proof(
             f"left its path: by up to {deviation * 1e3:.2f} mm, backend {backend.name!r} declares "
             f"a tracking error of {declared * 1e3:.2f} mm; allow more time"
         )
-    measured = world.certify(t, PolylinePath(joint_path), planner.measured_margin)
+    measured = world.certify(t, PolylinePath(joint_path), planner.measured_margin(stillness))
     if measured.verdict != "free":
         raise MotionRejected(
             f"left its path {' / '.join(measured.pair)}: by {deviation * 1e3:.1f} mm, "
@@ -239,7 +299,7 @@ def segment_proof(
         "measured": measured.to_json(),
         "deviation": deviation,
         "tracking_error": declared,
-        "body_stillness": BODY_STILLNESS,
+        "body_stillness": stillness,
         "duration": motion.duration,
     }
 
@@ -273,6 +333,7 @@ class DisturbanceCheck:
         t: int,
         start: Observation,
         config: AugmentConfig,
+        stillness: float = BODY_STILLNESS,
     ) -> None:
         """Compare with how things stood at waypoint `t`.
 
@@ -283,11 +344,12 @@ class DisturbanceCheck:
             start: what was measured before anything moved. It stands in for the demonstration,
                 where that doesn't tell where bodies were.
             config: says how far an object may slip in the grasp.
+            stillness: how far [m] any other body may be from where it was.
         """
         demonstration = world.demonstration
         self._openings = world.openings(t)
         self._grasped = world.phases[t].grasped
-        self._slip_tolerance = config.slip_tolerance
+        self._slip_tolerance, self._stillness = config.slip_tolerance, stillness
         self._T_world_tool = demonstration.steps.measured_Ts_world_tool[t]
         self._Ts_world_body, self._corners = {}, {}
         for body in scene.bodies:
@@ -311,21 +373,28 @@ class DisturbanceCheck:
                 f"gripper left its range: it is at {seen.gripper:.3f}, the proof is for "
                 f"{low:.3f} to {high:.3f}"
             )
-        for name, T in self._Ts_world_body.items():
-            change = seen.Ts_world_body[name] - T
-            most, what = BODY_STILLNESS, "was moved"
-            if name in self._grasped:
-                most, what = self._slip_tolerance, "slipped in the grasp"
-                change = (
-                    inverse(seen.T_world_tool) @ seen.Ts_world_body[name]
-                    - inverse(self._T_world_tool) @ T
-                )
-            # The farthest that any point of the body has moved.
-            moved = self._corners[name] @ change[:3, :3].T + change[:3, 3]
-            far = float(np.linalg.norm(moved, axis=1).max())
+        for name in self._Ts_world_body:
+            grasped = name in self._grasped
+            most = self._slip_tolerance if grasped else self._stillness
+            far = self._moved(name, seen)
             # Written so that what is no number is rejected.
             if not far <= most:
+                what = "slipped in the grasp" if grasped else "was moved"
                 raise MotionRejected(f"{name} {what}: by {far * 1e3:.2f} mm")
+
+    def moved(self, seen: Observation) -> float:
+        """How far [m] any body that isn't grasped is from where it was."""
+        others = self._Ts_world_body.keys() - self._grasped
+        return max((self._moved(name, seen) for name in others), default=0.0)
+
+    def _moved(self, name: str, seen: Observation) -> float:
+        """How far [m] any point of a body has moved; if it is grasped, in the grasp."""
+        before, now = self._Ts_world_body[name], seen.Ts_world_body[name]
+        if name in self._grasped:
+            before, now = inverse(self._T_world_tool) @ before, inverse(seen.T_world_tool) @ now
+        change = now - before
+        moved = self._corners[name] @ change[:3, :3].T + change[:3, 3]
+        return float(np.linalg.norm(moved, axis=1).max())
 
 
 def joint_rows(seen: Observation) -> Array:

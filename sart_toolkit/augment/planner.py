@@ -56,10 +56,9 @@ class SegmentPlanner:
         at = self._annotation.spheres[sphere]
         return strategy.propose(demonstration, at, rng, self._config.sampling), rng
 
-    @property
-    def measured_margin(self) -> float:
+    def measured_margin(self, stillness: float = BODY_STILLNESS) -> float:
         """What a measured path has to keep free [m]: `margin`, and what bodies may have moved."""
-        return round(self._config.margin + BODY_STILLNESS, _DIGITS)
+        return round(self._config.margin + stillness, _DIGITS)
 
     def approach(self, t: int) -> Array:
         """The joint targets `(m, n)` [rad], one a physics step, before a segment from waypoint `t`.
@@ -78,7 +77,11 @@ class SegmentPlanner:
         return self._approaches[t]
 
     def plan(
-        self, proposal: Proposal, rng: np.random.Generator, tracking_error: float
+        self,
+        proposal: Proposal,
+        rng: np.random.Generator,
+        tracking_error: float,
+        stillness: float = BODY_STILLNESS,
     ) -> tuple[Motion, Certificate]:
         """The motion from waypoint t* to a drawn pose, and the proof that it keeps the margin.
 
@@ -90,6 +93,7 @@ class SegmentPlanner:
             proposal: what `proposal` drew.
             rng: the random numbers that follow it.
             tracking_error: how far [m] any point of the robot may be from its commanded path.
+            stillness: how far [m] bodies may be from where the demonstration has them.
 
         Raises:
             Unreachable: no joint configuration reaches some pose.
@@ -97,7 +101,7 @@ class SegmentPlanner:
                 at t*.
         """
         config, t = self._config, proposal.t_star
-        margin = round(self.measured_margin + tracking_error, _DIGITS)
+        margin = round(self.measured_margin(stillness) + tracking_error, _DIGITS)
         demonstration = self.world.demonstration
         steps, record_hz = demonstration.steps, demonstration.rates.record_hz
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
