@@ -44,7 +44,14 @@ from sart_toolkit.data.storage import (
     write_json,
 )
 from sart_toolkit.doctor import machine
-from sart_toolkit.errors import InvalidInput, Mismatch, MissingFile, UnknownName
+from sart_toolkit.errors import (
+    InvalidInput,
+    Mismatch,
+    MissingFile,
+    OutputExists,
+    SartError,
+    UnknownName,
+)
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.record.devices import DEVICES, make_device
 from sart_toolkit.registry import check_known, reference_to
@@ -70,7 +77,7 @@ if TYPE_CHECKING:
     RobotLike = str | RobotSpec
     TaskLike = str | Task | type[Task]
     BackendLike = str | type[Backend]
-    Steer = Callable[[DeviceSetup, Device, Placement, SessionConfig], Demonstration]
+    Steer = Callable[[Path, DeviceSetup, Device, Placement, SessionConfig], Demonstration]
 
 _log = logging.getLogger(__name__)
 _TABLES: Mapping[str, Mapping[str, str]] = {
@@ -82,6 +89,8 @@ _TABLES: Mapping[str, Mapping[str, str]] = {
     "task": TASKS,
 }
 Kind = Literal["robot", "task", "backend"]
+# How often an operator may fail to reach the goal.
+_ATTEMPTS = 3
 
 
 class Progress(Protocol):
@@ -265,7 +274,7 @@ def record(
         robot: the task's own if left out.
         backend: where it is shown.
         device: what steers.
-        steer: follows a device that a person holds, and saves the recording.
+        steer: follows a device that a person holds, and saves the recording in the path given.
         by_hand: flags that mean nothing to any other device, which are refused with one.
         frame: what a person's directions are fixed to at first.
         operator: who steers, where it is a person.
@@ -324,7 +333,7 @@ def record(
                 raise InvalidInput(
                     f"device {steered.name!r}: is for a person's hands; record with `sart record`"
                 )
-            return steer(setup, steered, at, config)
+            return steer(out, setup, steered, at, config)
         for flag in by_hand:
             raise InvalidInput(
                 f"--{flag}: is for a device that a person holds; add --device keyboard, say"
@@ -338,6 +347,70 @@ def record(
     _check(demonstration, made.robot)
     save_demonstration(out, demonstration)
     return demonstration
+
+
+def record_several(
+    task: TaskLike,
+    out: Path,
+    count: int,
+    *,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    **options: Any,
+) -> list[Demonstration]:
+    """Demonstrations of one task, recorded one after the other and saved in directory `out`.
+
+    Those that are there are kept: called again after an interruption it resumes.
+
+    Args:
+        task: what is shown.
+        out: directory; `demo00.h5` and so on are written.
+        count: how many; each has a seed of its own, drawn from `seed`.
+        seed: of all that is random.
+        overwrite: whether those that are there may be replaced.
+        progress: called with the seconds recorded of each.
+        options: of `record`.
+
+    Raises:
+        InvalidInput: `count` is not positive, or as `record`.
+        UnknownName, Mismatch, CannotWrite: as `record`; an operator that doesn't reach the goal has
+            three attempts.
+        OutputExists: a file there holds something else.
+    """
+    if count < 1:
+        raise InvalidInput(f"count: expected at least 1, got {count}")
+    found = []
+    for i in range(count):
+        path = demonstration_path(out, i)
+        for attempt in range(_ATTEMPTS):
+            state = np.random.SeedSequence([seed, i, attempt]).generate_state(1)
+            own = int(state[0])
+            if path.exists() and not overwrite:
+                demonstration = load_demonstration(path)
+                # What a person steered has no seed.
+                if demonstration.seed in (own, None):
+                    break
+                if attempt < _ATTEMPTS - 1:
+                    continue
+                raise OutputExists(
+                    f"{path}: holds another demonstration; add --overwrite or choose another --out"
+                )
+            try:
+                demonstration = record(
+                    task, path, seed=own, overwrite=overwrite, progress=progress, **options
+                )
+                break
+            except Mismatch:
+                if attempt == _ATTEMPTS - 1:
+                    raise
+        found.append(demonstration)
+    return found
+
+
+def demonstration_path(directory: Path, i: int) -> Path:
+    """Where the i-th of several demonstrations is."""
+    return directory / f"demo{i:02d}.h5"
 
 
 def world_of(
@@ -418,8 +491,8 @@ def suggest(
 
 
 def augment(
-    demo: Path,
-    annotation: Path,
+    demo: Path | Sequence[Path],
+    annotation: Path | Sequence[Path],
     out: Path,
     *,
     task: TaskLike | None = None,
@@ -431,44 +504,87 @@ def augment(
     sensor: SensorErrors | None = None,
     **options: Any,
 ) -> Dataset:
-    """Trajectories generated from a demonstration's and an annotation's file, in directory `out`.
+    """Trajectories generated from demonstrations' and annotations' files, in directory `out`.
 
     Args:
-        demo: the demonstration.
-        annotation: its precision spheres.
+        demo: the demonstration, or several of one task.
+        annotation: its precision spheres, or those of several in any order; none where the strategy
+            needs none.
         out: directory to write; an interrupted generation resumes.
-        task, robot, backend: in place of those that the demonstration notes.
+        task, robot, backend: in place of those that the demonstrations note.
         workers: processes.
         overwrite: whether `out` may be replaced.
         progress: called with the trajectories kept.
         sensor: with `obstacles` "cloud", what the images may be off by; if left out, what the
             annotation says, where its spheres were suggested from the images.
-        options: of `AugmentConfig`.
+        options: of `AugmentConfig`. Without `n`, a strategy that draws nothing takes the
+            demonstrations that there are.
 
     Raises:
         MissingFile, BrokenFile: a file can't be read.
         UnknownName: task, robot or backend can't be found.
-        InvalidInput, Mismatch, MissingCapability, OutputExists, CannotWrite: as
-            `augment_demonstration`.
+        Mismatch: an annotation belongs to none of the demonstrations, or these look different.
+        InvalidInput, MissingCapability, OutputExists, CannotWrite: as `augment_sources`.
     """
-    check_names(task=task, robot=robot, backend=backend, strategy=options.get("strategy", "sart"))
-    demonstration = noted(load_demonstration(demo), task, robot, backend)
-    _check(demonstration, robot_of(demonstration, robot), str(demo))
-    spheres = load_annotation(annotation)
+    strategy = options.get("strategy", "sart")
+    check_names(task=task, robot=robot, backend=backend, strategy=strategy)
+    demos = [demo] if isinstance(demo, Path) else list(demo)
+    sources = _sources(demos, [annotation] if isinstance(annotation, Path) else annotation)
+    for path, (demonstration, _) in zip(demos, sources, strict=True):
+        _check(demonstration, robot_of(demonstration, robot), str(path))
+    sources = [(noted(d, task, robot, backend), spheres) for d, spheres in sources]
+    first, annotated = sources[0][0], [a for _, a in sources if a is not None]
+    from sart_toolkit.augment import get_strategy
     from sart_toolkit.augment.config import AugmentConfig
-    from sart_toolkit.augment.engine import augment_demonstration
+    from sart_toolkit.augment.engine import augment_sources
 
+    draws = get_strategy(strategy).draws
+    if not draws:
+        options.setdefault("n", len(sources))
+    elif len({str(d.task_parameters.get("appearance")) for d, _ in sources}) > 1:
+        raise Mismatch(
+            "the demonstrations' scenes look different (--vary-appearance), and segments are seen "
+            "in one; record them with the same --seed, or make a dataset of each"
+        )
     _check_sensor(options.get("obstacles"), sensor)
-    if options.get("obstacles") == "cloud" and "cloud" not in options:
-        options["cloud"] = _cloud_of(spheres, sensor)
+    if options.get("obstacles") == "cloud" and "cloud" not in options and annotated:
+        options["cloud"] = _cloud_of(annotated[0], sensor)
     config = AugmentConfig(**options)
-    size, rates = image_size_of(demonstration), demonstration.rates
-    _warn_of_unproved(demonstration, spheres, config, task, robot)
-    make = backend_maker(demonstration, size, rates, task, robot, backend)
-    return augment_demonstration(
-        demonstration, spheres, make, out, config, workers, overwrite,
+    for demonstration, spheres in sources:
+        if spheres is not None:
+            _warn_of_unproved(demonstration, spheres, config, task, robot)
+    size, rates = image_size_of(first), first.rates
+    make = backend_maker(first, size, rates, task, robot, backend)
+    return augment_sources(
+        sources, make, out, config, workers, overwrite,
         lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
     )  # fmt: skip
+
+
+def _sources(
+    demos: Sequence[Path], annotations: Sequence[Path]
+) -> list[tuple[Demonstration, Annotation | None]]:
+    """Demonstrations, each with the annotation that names it.
+
+    Raises:
+        MissingFile, BrokenFile: a file can't be read.
+        Mismatch: an annotation names none of them, or two name one, or a demonstration is there
+            twice.
+    """
+    read = {path: load_demonstration(path) for path in demos}
+    hashes = {path: demonstration.content_hash() for path, demonstration in read.items()}
+    if len(set(hashes.values())) < len(demos):
+        raise Mismatch("the same demonstration is given twice; leave one out")
+    found: dict[str, Annotation] = {}
+    for path in annotations:
+        spheres = load_annotation(path)
+        if spheres.demonstration_hash in found:
+            raise Mismatch(f"{path}: a second annotation of one demonstration; leave one out")
+        if spheres.demonstration_hash not in hashes.values():
+            # Says which, and what to do about it.
+            spheres.check_matches(read[demos[0]])
+        found[spheres.demonstration_hash] = spheres
+    return [(read[path], found.get(hashes[path])) for path in demos]
 
 
 def _check_sensor(source: str | None, sensor: SensorErrors | None) -> None:
@@ -540,7 +656,7 @@ def validate(
 def train_policy(
     dataset: Path,
     out: Path,
-    policy: str | type[Policy] = "compact_mlp",
+    policy: str | type[Policy] | None = None,
     *,
     overwrite: bool = False,
     progress: Progress = _silent,
@@ -551,7 +667,7 @@ def train_policy(
     Args:
         dataset: directory from `augment`.
         out: directory to write; an interrupted training resumes.
-        policy: what is trained.
+        policy: what is trained; what the dataset's strategy is for if left out.
         overwrite: whether a skill in `out` may be replaced, or an interrupted training forgotten.
         progress: called with the steps done.
         options: of `TrainConfig`; the policy's own where left out or None.
@@ -562,8 +678,10 @@ def train_policy(
             from (`check_recording`).
         OutputExists, CannotWrite: `out` can't be written.
     """
-    check_names(policy=policy)
     generated = load_dataset(dataset)
+    if policy is None:
+        policy = _policy_for(generated)
+    check_names(policy=policy)
     check_writable(out / "config.json", overwrite)
     from sart_toolkit.record.checks import check_recording
 
@@ -582,6 +700,17 @@ def train_policy(
     )  # fmt: skip
     save_skill(out, result, generated)
     return config
+
+
+def _policy_for(dataset: Dataset) -> str:
+    """The policy that the dataset's strategy is for; where it can't be found, any strategy's."""
+    from sart_toolkit.augment import get_strategy
+    from sart_toolkit.augment.strategies import Strategy
+
+    try:
+        return get_strategy(dataset.info["config"]["strategy"]).policy
+    except (LookupError, TypeError, SartError):
+        return Strategy.policy
 
 
 def _train_config(policy: str | type[Policy], options: Mapping[str, Any]) -> TrainConfig:
@@ -681,8 +810,9 @@ def run(
     robot: RobotLike | None = None,
     backend: BackendLike = "pybullet",
     strategy: str | Strategy = "sart",
-    policy: str | type[Policy] = "compact_mlp",
-    n: int = 40,
+    policy: str | type[Policy] | None = None,
+    n: int | None = None,
+    demonstrations: int | None = None,
     episodes: int = 50,
     epochs: int | None = None,
     distribution: Literal["paper", "area"] = "paper",
@@ -707,8 +837,11 @@ def run(
         robot: the task's own if left out.
         backend: where all of it happens.
         strategy: how segments are drawn.
-        policy: what is trained.
-        n: trajectories in all, the demonstration among them.
+        policy: what is trained; what the strategy is for if left out.
+        n: trajectories in all, the demonstrations among them; the strategy's own number if left
+            out.
+        demonstrations: how many are recorded, at random placements if more than one; 1 if left out,
+            or `n` where the strategy draws nothing.
         episodes: rollouts with random placements.
         epochs: of training, the policy's own if None.
         distribution: how positions are drawn on a sphere.
@@ -731,11 +864,19 @@ def run(
     out = Path(out)
     check_names(task=task, robot=robot, backend=backend, strategy=strategy, policy=policy)
     size = _checked_size(image_size)
+    from sart_toolkit.augment import get_strategy
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.data.sampling import SamplingConfig
     from sart_toolkit.evaluate.rollout import EvaluateConfig
 
     # What can't work should be said before anything is written.
+    drawing = get_strategy(strategy)
+    policy = policy or drawing.policy
+    n = drawing.n if n is None else n
+    count = (1 if drawing.draws else n) if demonstrations is None else demonstrations
+    if count < 1 or (n != count and not drawing.draws) or (n <= count and drawing.draws):
+        fewer = f"fewer than the {n} trajectories" if drawing.draws else f"{n}, as trajectories"
+        raise InvalidInput(f"demonstrations: expected at least 1, and {fewer}, got {count}")
     found = get_task(task)
     get_robot(robot or found.robot)
     get_backend(backend)
@@ -756,6 +897,7 @@ def run(
         "strategy": drawn.strategy,
         "policy": trained.policy,
         "n": n,
+        "demonstrations": count,
         "episodes": episodes,
         "seed": seed,
         "eval_seed": eval_seed,
@@ -768,18 +910,34 @@ def run(
     state = _resumed(out, wanted, overwrite)
     state |= {"command": command, "versions": library_versions(), "machine": machine()}
     write_json(out / "run.json", state)
-    demo, spheres, dataset = out / "demo.h5", out / "annotation.json", out / "dataset"
-    skill, evaluation = out / "skill", out / "evaluation.json"
+    skill, evaluation, dataset = out / "skill", out / "evaluation.json", out / "dataset"
+    demos, spheres = [out / "demo.h5"], [out / "annotation.json"]
+    if count > 1:
+        demos = [demonstration_path(out / "demos", i) for i in range(count)]
+        spheres = [path.with_suffix(".json") for path in demos]
+    if not drawing.draws:
+        spheres = []
+
+    def show() -> None:
+        shown: dict[str, Any] = {
+            "robot": robot, "backend": backend, "seed": seed, "cameras": cameras,
+            "image_size": size, "progress": progress,
+        }  # fmt: skip
+        if count == 1:
+            record(task, demos[0], **shown)
+        else:
+            record_several(task, demos[0].parent, count, placement="random", **shown)
+
+    def annotate() -> None:
+        for demo, path in zip(demos, spheres, strict=True):
+            if not path.exists():
+                suggest(demo, path, task=task, robot=robot, progress=progress)
+
     steps: list[tuple[str, Path, Callable[[], object]]] = [
-        ("record", demo, lambda: record(
-            task, demo, robot=robot, backend=backend, seed=seed, cameras=cameras, image_size=size,
-            progress=progress,
-        )),
-        ("suggest", spheres, lambda: suggest(
-            demo, spheres, task=task, robot=robot, progress=progress,
-        )),
+        ("record", demos[-1], show),
+        *([("suggest", spheres[-1], annotate)] if spheres else []),
         ("augment", dataset / "dataset.json", lambda: augment(
-            demo, spheres, dataset, task=task, robot=robot, backend=backend, workers=workers,
+            demos, spheres, dataset, task=task, robot=robot, backend=backend, workers=workers,
             progress=progress, **generation,
         )),
         ("train", skill / "config.json", lambda: train_policy(

@@ -34,9 +34,9 @@ class Simulator(PyBulletBackend):
 
 
 class Inside(sart.Strategy):
-    def propose(self, demonstration, sphere, rng, config):
-        t_star = sart.convergence_waypoint(demonstration, sphere)
-        return sart.Proposal(t_star, sart.sample_pose(sphere, rng, config))
+    def propose(self, demonstration, spheres, i, rng, config):
+        t_star = sart.convergence_waypoint(demonstration, spheres[i])
+        return sart.Proposal(t_star, sart.sample_pose(spheres[i], rng, config))
 
 
 INSIDE = Inside()

@@ -13,7 +13,7 @@ import pytest
 from sart_toolkit import registry
 from sart_toolkit.augment import STRATEGIES, get_strategy
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.strategies import SART, Sart
+from sart_toolkit.augment.strategies import SART, SphereStrategy
 from sart_toolkit.backends import BACKENDS, get_backend, make_backend
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.errors import InvalidInput, MissingExtra, UnknownName
@@ -29,7 +29,7 @@ MINE = """
 import dataclasses
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.learn.policies.compact_mlp import CompactMLP
-from sart_toolkit.augment.strategies import Sart
+from sart_toolkit.augment.strategies import SphereStrategy
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks.peg_in_hole import PegInHole
 
@@ -49,7 +49,7 @@ class Mine(PyBulletBackend):
 class MyPolicy(CompactMLP):
     pass
 
-INSIDE = Sart()
+INSIDE = SphereStrategy()
 NUMBER = 3
 """
 
@@ -117,7 +117,7 @@ def test_what_is_inside_a_function_has_no_reference():
     class Local(PegInHole):
         pass
 
-    class LocalStrategy(Sart):
+    class LocalStrategy(SphereStrategy):
         pass
 
     assert reference_to("task", Local(), TASKS) is None

@@ -1,4 +1,4 @@
-"""Self-augmentation: which poses to visit (strategies) and visiting them (engine).
+"""Self-augmentation: which poses to visit (strategies) and visiting them (executors, engine).
 
 A new strategy is one class and one line in `STRATEGIES`; one outside the repository needs no
 line, `package.module:NAME` or `path/to/file.py:NAME` names it.
@@ -16,6 +16,19 @@ if TYPE_CHECKING:
 STRATEGIES = {
     "sart": "sart_toolkit.augment.strategies:SART",
     "sart_planned": "sart_toolkit.augment.strategies:SART_PLANNED",
+    "no_position": "sart_toolkit.augment.strategies:NO_POSITION",
+    "no_orientation": "sart_toolkit.augment.strategies:NO_ORIENTATION",
+    "return_to_center": "sart_toolkit.augment.strategies:RETURN_TO_CENTER",
+    "no_merge": "sart_toolkit.augment.strategies:NO_MERGE",
+    "next_sphere_center": "sart_toolkit.augment.strategies:NEXT_SPHERE_CENTER",
+    "next_sphere_convergence": "sart_toolkit.augment.strategies:NEXT_SPHERE_CONVERGENCE",
+    "extended_convergence": "sart_toolkit.augment.strategies:EXTENDED_CONVERGENCE",
+    "inside_sphere": "sart_toolkit.augment.strategies:INSIDE_SPHERE",
+    "miles": "sart_toolkit.augment.strategies:MILES",
+    "miles_1cm": "sart_toolkit.augment.strategies:MILES_1CM",
+    "miles_10cm": "sart_toolkit.augment.strategies:MILES_10CM",
+    "bc": "sart_toolkit.augment.strategies:BC",
+    "replay": "sart_toolkit.augment.strategies:REPLAY",
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -27,8 +27,8 @@ ALLOCATIONS = ("radius", "equal")
 class AugmentConfig:
     """What to generate.
 
-    `n`: trajectories in all, the demonstrations among them; `quotas` allocates the others to the
-    spheres, weighted by radius, or with `allocation` "equal" all the same, as in the paper.
+    `n`: trajectories in all, the demonstrations among them; the others are allocated to the spheres
+    (see `allocate`) weighted by radius, or with `allocation` "equal" all the same, as in the paper.
     `duration` [s] is the paper's delta, the least that a segment takes, rounded up to whole
     recorded steps. Every segment is proved to keep `margin` [m] free of the `obstacles`, the bodies
     of the scene or the cloud that the demonstration's cameras saw (made as `cloud` says): as
@@ -57,8 +57,11 @@ class AugmentConfig:
     recording: Recording = "reversed"
 
     def __post_init__(self) -> None:
-        if self.n < 2:
-            raise InvalidInput(f"n: expected at least 2 (the demonstration counts), got {self.n}")
+        least = 2 if get_strategy(self.strategy).draws else 1
+        if self.n < least:
+            raise InvalidInput(
+                f"n: expected at least {least} (the demonstration counts), got {self.n}"
+            )
         if self.seed < 0:
             raise InvalidInput(f"seed: expected a whole number >= 0, got {self.seed}")
         if self.allocation not in ALLOCATIONS:
@@ -72,7 +75,6 @@ class AugmentConfig:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidInput(f"{name}: expected a finite number >= 0 m, got {value}")
-        get_strategy(self.strategy)
         if self.cameras is not None:
             object.__setattr__(self, "cameras", tuple(self.cameras))
         reference = lasting_reference("strategy", self.strategy, STRATEGIES)
@@ -89,23 +91,3 @@ class AugmentConfig:
         if "cloud" in values:
             cloud = CloudConfig.from_json(values["cloud"])
         return cls(**{**values, "sampling": sampling, "cloud": cloud})
-
-    def quotas(self, radii: Sequence[float], demonstrations: int = 1) -> list[int]:
-        """How many trajectories spheres of the given radii [m] get, of n less the demonstrations.
-
-        One after the other goes to the sphere with the greatest weight / (2 trajectories + 1)
-        (Webster's method), so that more trajectories never take one away from any sphere. With
-        equal weights that is round-robin.
-
-        Raises:
-            InvalidInput: the demonstrations alone are n.
-        """
-        if self.n <= demonstrations:
-            raise InvalidInput(
-                f"n: expected more than the {demonstrations} demonstrations, got {self.n}"
-            )
-        weights = np.ones(len(radii)) if self.allocation == "equal" else np.asarray(radii)
-        counts = np.zeros(len(radii), dtype=int)
-        for _ in range(self.n - demonstrations):
-            counts[np.argmax(weights / (2 * counts + 1))] += 1
-        return [int(count) for count in counts]

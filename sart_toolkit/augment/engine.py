@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from sart_toolkit.augment import get_strategy
+from sart_toolkit.augment.allocation import allocate
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import Spare, get_executor, no_spare
 from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.data.dataset import Dataset, Source
 from sart_toolkit.data.manifest import AttemptKey, EpisodeEntry, Rejection
 from sart_toolkit.data.records import Annotation, Demonstration
-from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles, check_sources
+from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles, SphereShare, check_sources
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.workers import worker_map
 
@@ -73,7 +78,7 @@ class _Worker:
 
 def augment_demonstration(
     demonstration: Demonstration,
-    annotation: Annotation,
+    annotation: Annotation | None,
     make_backend: BackendFactory,
     out: Path,
     config: AugmentConfig | None = None,
@@ -88,7 +93,7 @@ def augment_demonstration(
 
 
 def augment_sources(
-    sources: Sequence[tuple[Demonstration, Annotation]],
+    sources: Sequence[tuple[Demonstration, Annotation | None]],
     make_backend: BackendFactory,
     out: Path,
     config: AugmentConfig | None = None,
@@ -99,12 +104,13 @@ def augment_sources(
 ) -> Dataset:
     """Generate a dataset directory from demonstrations of one task and their annotations.
 
-    The trajectories are allocated to the spheres of all demonstrations. Neither the number of
-    workers nor an interruption changes what is generated: called again with the same arguments it
-    resumes.
+    The trajectories are allocated to the spheres of all demonstrations; what a sphere can't give
+    is asked of the others. Neither the number of workers nor an interruption changes what is
+    generated: called again with the same arguments it resumes.
 
     Args:
-        sources: demonstrations, each with its precision spheres.
+        sources: demonstrations, each with its precision spheres, `None` where the strategy needs
+            none.
         make_backend: makes the robot in the demonstrations' scene; picklable if `workers` > 1.
         out: directory to write.
         config: what to generate.
@@ -121,20 +127,26 @@ def augment_sources(
         OutputExists: `out` holds something else and `overwrite` is false.
         CannotWrite: the disk refuses, or another process is at work on `out`.
         InvalidInput: no attempt from any sphere was kept, `workers` is not positive or more than
-            the executor can use, or there is no demonstration, or not fewer than trajectories
-            wanted.
+            the executor can use, there is no demonstration, or not fewer than trajectories wanted
+            (by a strategy that draws nothing: not as many), or no annotation where one is needed.
     """
     config = config or AugmentConfig()
     # All that can be refused is refused before anything is replaced.
     check_sources(sources)
     if workers < 1:
         raise InvalidInput(f"workers: expected at least 1, got {workers}")
-    spheres = [
-        (source, sphere, annotation.spheres[sphere].radius)
-        for source, (_, annotation) in enumerate(sources)
-        for sphere in range(len(annotation.spheres))
+    strategy = get_strategy(config.strategy)
+    drawn = [
+        (source, i, sphere)
+        for source, (demonstration, annotation) in enumerate(sources)
+        for i, sphere in enumerate(strategy.spheres(demonstration, annotation))
     ]
-    quotas = config.quotas([radius for *_, radius in spheres], len(sources))
+    wanted = _wanted(config, len(sources), strategy.draws)
+    weights = strategy.weights([sphere for *_, sphere in drawn], config.allocation)
+    shares = [
+        SphereShare(source, i, sphere.waypoint, share)
+        for (source, i, sphere), share in zip(drawn, allocate(wanted, weights), strict=True)
+    ]
     demonstrations = [demonstration for demonstration, _ in sources]
     with closing(make_backend()) as backend:
         executor = get_executor(config.execution, backend, demonstrations)
@@ -142,7 +154,8 @@ def augment_sources(
             raise InvalidInput(
                 f"workers: executor {config.execution!r} needs 1 process, got {workers}"
             )
-        executor.check(backend, demonstrations, config, ask)
+        if drawn:
+            executor.check(backend, demonstrations, config, ask)
         request = _request(backend, config)
     started = time.perf_counter()
     with DatasetWriter(out, sources, request, overwrite) as writer:
@@ -151,24 +164,25 @@ def augment_sources(
 
         resumed = writer.n_kept + writer.n_rejected > 0
 
-        wanted = {
-            (source, sphere): quota
-            for (source, sphere, _), quota in zip(spheres, quotas, strict=True)
-        }
+        def missing() -> list[list[AttemptKey]]:
+            """The attempts still needed from each sphere, no more than can all be kept."""
+            most = []
+            for share in shares:
+                kept, made = writer.count(share.source, share.sphere)
+                most.append(kept if made >= _limit(share) else np.inf)
+            return [
+                writer.missing(share.source, share.sphere, quota, _limit(share))
+                for share, quota in zip(shares, allocate(wanted, weights, most), strict=True)
+            ]
 
-        def missing(source: int, sphere: int) -> list[AttemptKey]:
-            """The attempts still needed from a sphere, no more than can all be kept."""
-            quota = wanted[source, sphere]
-            limit = max(_LEAST_ATTEMPTS, _ATTEMPTS_PER_EPISODE * quota)
-            return writer.missing(source, sphere, quota, limit)
-
-        def all_missing() -> list[AttemptKey]:
-            keys = [key for sphere in wanted for key in missing(*sphere)]
-            return sorted(keys, key=lambda key: (key.k, key.source, key.sphere))
+        given: set[AttemptKey] = set()
 
         def spare(source: int, sphere: int) -> AttemptKey | None:
             """One more attempt from a sphere, if those under way can't be enough."""
-            further = [key for key in missing(source, sphere) if key not in given]
+            further = [
+                key for keys in missing() for key in keys
+                if key[:2] == (source, sphere) and key not in given
+            ]  # fmt: skip
             given.update(further[:1])
             return further[0] if further else None
 
@@ -177,8 +191,9 @@ def augment_sources(
             _Worker, make_backend, writer.sources, writer.files, config, ask
         )
         with _results(make_worker, workers) as results:
-            while keys := all_missing():
-                given = set(keys)
+            while keys := sorted(itertools.chain(*missing()), key=_by_number):
+                given.clear()
+                given.update(keys)
                 for key, entry, rejection, reset in results(keys, spare):
                     resets += reset
                     if entry is None:
@@ -186,11 +201,37 @@ def augment_sources(
                     else:
                         writer.keep(entry)
                     if progress is not None:
-                        progress(writer.n_kept, sum(quotas), writer.n_rejected)
+                        progress(writer.n_kept, wanted, writer.n_rejected)
         # How long an interrupted generation took in all, with how many resets, is not known.
         seconds = None if resumed else time.perf_counter() - started
-        counted = None if resumed else resets
-        return _finish(writer, sources[0][0], config, sum(quotas), seconds, counted)
+        return _finish(writer, sources[0][0], config, shares, seconds, None if resumed else resets)
+
+
+def _wanted(config: AugmentConfig, demonstrations: int, draws: bool) -> int:
+    """How many trajectories are to be generated.
+
+    Raises:
+        InvalidInput: the demonstrations are too many, or other than n where nothing is drawn.
+    """
+    if draws and config.n <= demonstrations:
+        raise InvalidInput(
+            f"n: expected more than the {demonstrations} demonstrations, got {config.n}"
+        )
+    if not draws and config.n != demonstrations:
+        raise InvalidInput(
+            f"n: strategy {config.strategy!r} draws nothing, so expected the number of "
+            f"demonstrations ({demonstrations}), got {config.n}"
+        )
+    return config.n - demonstrations
+
+
+def _limit(share: SphereShare) -> int:
+    """How many attempts a sphere has; a share is not asked of it again and again in vain."""
+    return max(_LEAST_ATTEMPTS, _ATTEMPTS_PER_EPISODE * (share.wanted or 0))
+
+
+def _by_number(key: AttemptKey) -> tuple[int, int, int]:
+    return key.k, key.source, key.sphere
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
@@ -219,19 +260,27 @@ def _finish(
     writer: DatasetWriter,
     demonstration: Demonstration,
     config: AugmentConfig,
-    wanted: int,
+    shares: Sequence[SphereShare],
     seconds: float | None,
     resets: int | None,
 ) -> Dataset:
-    attempted = writer.n_kept + writer.n_rejected
-    reasons = ", ".join(f"{reason}: {count}" for reason, count in writer.rejections.items())
-    if not writer.n_kept:
+    wanted = sum(share.wanted or 0 for share in shares)
+    if wanted and not writer.n_kept:
         last = writer.last_rejection
         raise InvalidInput(
-            f"none of {attempted} attempts was kept ({reasons}); use smaller radii or other "
-            "waypoints" + (f"; the last: {last.detail}" if last and last.detail else "")
+            f"none of {writer.n_rejected} attempts was kept ({_listed(writer.rejections)}); use "
+            "smaller radii or other waypoints"
+            + (f"; the last: {last.detail}" if last and last.detail else "")
         )
+    for tally in writer.by_sphere(shares):
+        if tally["kept"] < tally["wanted"]:
+            _log.warning(
+                "sphere at waypoint %d of demonstration %d gave %d of %d trajectories (%s)",
+                tally["waypoint"], tally["source"], tally["kept"], tally["wanted"],
+                _listed(tally["rejections"]),
+            )  # fmt: skip
     if writer.n_kept < wanted:
+        reasons = _listed(writer.rejections)
         _log.warning("only %d of %d trajectories were kept (%s)", writer.n_kept, wanted, reasons)
     return writer.finish(
         {
@@ -242,5 +291,10 @@ def _finish(
             "resets": resets,
             "config": config.to_json(),
             "references": dict(demonstration.references),
-        }
+        },
+        shares,
     )
+
+
+def _listed(reasons: Mapping[str, int]) -> str:
+    return ", ".join(f"{reason}: {count}" for reason, count in reasons.items())

@@ -66,7 +66,7 @@ class SegmentExecutor(abc.ABC):
     def __init__(
         self,
         backend: Backend,
-        sources: Sequence[tuple[Demonstration, Annotation]],
+        sources: Sequence[tuple[Demonstration, Annotation | None]],
         config: AugmentConfig,
         ask: Callable[[str], None] | None = None,
     ) -> None:
@@ -158,7 +158,7 @@ class SegmentExecutor(abc.ABC):
         """
         config, t = self._config, proposal.t_star
         provenance = Provenance(
-            demonstration_hash=self._sources[key.source][1].demonstration_hash,
+            demonstration_hash=self.planner(key.source).demonstration_hash,
             source=key.source,
             sphere=key.sphere,
             k=key.k,
@@ -170,6 +170,7 @@ class SegmentExecutor(abc.ABC):
             certificate=segment_proof(
                 self.planner(key.source), t, motion, certificate, path, self._backend, stillness
             ),
+            merged=proposal.merged,
             recording=config.recording,
         )
         return Episode(steps, provenance, path)
@@ -242,7 +243,9 @@ class RestoreExecutor(SegmentExecutor):
             require(self._backend, SavesStates, _FROM_STATES).restore(demonstration.states[t])
             run = SegmentRun(self._backend, planner, t, self._config, stillness)
             run.execute(planner.approach(t), motion)
-            episode = self._episode(key, proposal, motion, certificate, run.steps(), run.joint_path)
+            episode = self._episode(
+                key, proposal, motion, certificate, run.steps(), run.joint_path, stillness
+            )
         except (Unreachable, MotionRejected) as error:
             return rejected(key, error, run)
         return Attempt(key, KEPT, episode, seconds=run.seconds)

@@ -29,18 +29,25 @@ _DIGITS = 9
 
 
 class SegmentPlanner:
-    """Draws segments of one demonstration and annotation, and proves them clear; moves nothing."""
+    """Draws segments of one demonstration and annotation, and proves them clear; moves nothing.
+
+    Attributes:
+        world: the obstacles.
+        demonstration_hash: the content hash of the demonstration.
+    """
 
     def __init__(
         self,
         world: CollisionWorld,
-        annotation: Annotation,
+        annotation: Annotation | None,
         config: AugmentConfig,
         source: int = 0,
     ) -> None:
         """Plan for a robot among the obstacles of a demonstration, the dataset's `source`-th."""
         self.world = world
-        self._annotation, self._config, self._source = annotation, config, source
+        self.demonstration_hash = world.demonstration.content_hash()
+        self._config, self._source = config, source
+        self._spheres = get_strategy(config.strategy).spheres(world.demonstration, annotation)
         self._approaches: dict[int, Array] = {}
         # What is proved of them, by waypoint and margin: all segments from a waypoint share it.
         self._approach_proofs: dict[tuple[int, float], Certificate] = {}
@@ -52,9 +59,8 @@ class SegmentPlanner:
         """
         rng = np.random.default_rng([self._config.seed, sphere, k, self._source])
         strategy = get_strategy(self._config.strategy)
-        demonstration = self.world.demonstration
-        at = self._annotation.spheres[sphere]
-        return strategy.propose(demonstration, at, rng, self._config.sampling), rng
+        demonstration, sampling = self.world.demonstration, self._config.sampling
+        return strategy.propose(demonstration, self._spheres, sphere, rng, sampling), rng
 
     def measured_margin(self, stillness: float = BODY_STILLNESS) -> float:
         """What a measured path has to keep free [m]: `margin`, and what bodies may have moved."""

@@ -80,7 +80,7 @@ class ReplayExecutor(SegmentExecutor):
     def __init__(
         self,
         backend: Backend,
-        sources: Sequence[tuple[Demonstration, Annotation]],
+        sources: Sequence[tuple[Demonstration, Annotation | None]],
         config: AugmentConfig,
         ask: Callable[[str], None] | None = None,
     ) -> None:

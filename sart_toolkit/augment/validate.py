@@ -80,7 +80,8 @@ def validate_dataset(
     """
     dataset = load_dataset(path)
     for source in dataset.sources:
-        source.annotation.check_matches(source.demonstration)
+        if source.annotation is not None:
+            source.annotation.check_matches(source.demonstration)
     try:
         config = AugmentConfig.from_json(dataset.info["config"])
     except (KeyError, TypeError) as error:
@@ -136,7 +137,7 @@ class _EpisodeCheck:
         planner = self._planners[p.source]
         proposal, rng = planner.proposal(p.sphere, p.k)
         far = np.abs(proposal.T_world_sampled - p.T_world_sampled).max()
-        if p.t_star != proposal.t_star or far > _POSE_TOLERANCE:
+        if (p.t_star, p.merged) != (proposal.t_star, proposal.merged) or far > _POSE_TOLERANCE:
             raise MotionRejected("provenance: seed, sphere and k lead to another pose or waypoint")
         if not p.certificate:
             raise MotionRejected("certificate: there is none")

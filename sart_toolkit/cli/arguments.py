@@ -48,15 +48,26 @@ _STRATEGY = Annotated[
     str,
     arg(
         metavar="REF",
-        help="sart: straight lines; sart_planned: round obstacles where these are blocked; or "
-        "your own.",
+        help="sart: straight lines; sart_planned: round obstacles where these are blocked; an "
+        "ablation or baseline of docs/strategies.md, such as miles or bc; or your own.",
     ),
 ]
 _POLICY = Annotated[
-    str,
-    arg(metavar="REF", help="Policy: compact_mlp, resnet18_mlp as in the paper, or your own."),
+    str | None,
+    _optional(
+        "REF",
+        "Policy: compact_mlp, resnet18_mlp as in the paper, replay, or your own; what the strategy "
+        "is for if left out (compact_mlp, or replay).",
+    ),
 ]
-_N = Annotated[int, arg(help="Trajectories in all, the demonstration among them.")]
+_N = Annotated[
+    int | None,
+    _optional(
+        "INT",
+        "Trajectories in all, the demonstrations among them; 40 if left out, or what the strategy "
+        "needs.",
+    ),
+]
 _EPISODES = Annotated[int, arg(help="Rollouts with random placements.")]
 _EVAL_SEED = Annotated[int, arg(help="Seed of the placements, separate from training's.")]
 _YAW = Annotated[
@@ -118,6 +129,10 @@ class Run:
 
     Example: sart run drawer.py:Drawer --robot my_panda:PANDA --out runs/drawer
 
+    Example: sart run peg_in_hole --out runs/bc --strategy bc
+
+    Example: sart run peg_in_hole --out runs/three --demonstrations 3
+
     An interrupted run resumes when the same command is typed again.
     """
 
@@ -126,8 +141,16 @@ class Run:
     backend: _BACKEND = "pybullet"
     robot: _ROBOT = None
     strategy: _STRATEGY = "sart"
-    policy: _POLICY = "compact_mlp"
-    n: _N = 40
+    policy: _POLICY = None
+    n: _N = None
+    demonstrations: Annotated[
+        int | None,
+        _optional(
+            "INT",
+            "Demonstrations to record, at random placements if more than one; 1 if left out, or "
+            "all N with bc.",
+        ),
+    ] = None
     episodes: _EPISODES = 50
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000
@@ -152,10 +175,20 @@ class Record:
     Example: sart record toolbox_picking --out demo.h5 --backend sapien
 
     Example: sart record peg_in_hole --out demo.h5 --seed 3 --placement random --yaw-deg 10
+
+    Example: sart record peg_in_hole --out demos --count 40 --placement random
     """
 
     task: _TASK
-    out: Annotated[Path, arg(help="HDF5 file to write.")]
+    out: Annotated[Path, arg(help="HDF5 file to write; with --count, the directory of as many.")]
+    count: Annotated[
+        int | None,
+        _optional(
+            "INT",
+            "Record several, in directory OUT, each with a seed of its own; those that are there "
+            "are kept.",
+        ),
+    ] = None
     device: Annotated[
         str,
         arg(
@@ -317,17 +350,26 @@ class Augment:
 
     Example: sart augment demo.h5 annotation.json --out dataset --source cloud
 
-    With --source cloud, images are read as the annotation says, where its spheres were suggested
-    from them; flags about the sensor replace that. An interrupted generation resumes when the same
+    Example: sart augment demos/*.h5 annotations/*.json --out dataset --n 100
+
+    Example: sart augment demos/*.h5 --out dataset --strategy bc
+
+    Each annotation finds its demonstration; trajectories are allocated to the spheres of all. With
+    --source cloud, images are read as the annotation says, where its spheres were suggested from
+    them; flags about the sensor replace that. An interrupted generation resumes when the same
     command is typed again.
     """
 
-    demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
-    annotation: Annotated[
-        Positional[Path], arg(metavar="ANNOTATION", help="Spheres from `sart suggest`.")
+    files: Annotated[
+        Positional[tuple[Path, ...]],
+        arg(
+            metavar="FILE [FILE ...]",
+            help="Demonstrations of one task (.h5), and the spheres of each (.json), in any order.",
+            help_behavior_hint="",
+        ),
     ]
     out: Annotated[Path, arg(help="Directory to write.")]
-    n: _N = 40
+    n: _N = None
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
     backend: _NOTED_BACKEND = None
@@ -403,7 +445,7 @@ class Train:
         Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment`.")
     ]
     out: Annotated[Path, arg(help="Skill directory to write.")]
-    policy: _POLICY = "compact_mlp"
+    policy: _POLICY = None
     epochs: _EPOCHS = None
     lr: Annotated[
         float | None, _optional("FLOAT", "Learning rate; the policy's own if left out.")
@@ -607,8 +649,8 @@ class BenchmarkSkill:
     out: Annotated[Path, arg(help="Directory to write.")]
     tasks: _TASKS = "all"
     backends: _BACKENDS = "all"
-    policy: _POLICY = "compact_mlp"
-    n: _N = 40
+    policy: _POLICY = None
+    n: _N = None
     epochs: _EPOCHS = None
     episodes: _EPISODES = 20
     seed: _SEED = 0

@@ -11,16 +11,20 @@ from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
 from sart_toolkit.data.sampling import SamplingConfig
-from sart_toolkit.errors import Mismatch
+from sart_toolkit.errors import InvalidInput, Mismatch
 
 
 def augment_verb(args: Augment) -> dict[str, Any]:
     """`sart augment`."""
     sensor = declared_sensor(args)
+    annotations = [path for path in args.files if path.suffix == ".json"]
+    demos = [path for path in args.files if path not in annotations]
+    if not demos:
+        raise InvalidInput("FILE: expected a demonstration, got annotations alone; add its .h5")
     with ProgressDisplay() as progress:
         dataset = pipeline.augment(
-            args.demo,
-            args.annotation,
+            demos,
+            annotations,
             args.out,
             task=args.task,
             robot=args.robot,
@@ -29,7 +33,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
             overwrite=args.overwrite,
             progress=progress,
             sensor=sensor,
-            n=args.n,
+            **({} if args.n is None else {"n": args.n}),
             allocation=args.allocation,
             strategy=args.strategy,
             sampling=SamplingConfig(args.distribution, args.rotation_per_metre),

@@ -20,6 +20,7 @@ def run_verb(args: Run) -> dict[str, Any]:
             strategy=args.strategy,
             policy=args.policy,
             n=args.n,
+            demonstrations=args.demonstrations,
             episodes=args.episodes,
             epochs=args.epochs,
             distribution=args.distribution,

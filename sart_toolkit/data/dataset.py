@@ -32,10 +32,11 @@ class Source:
 
     Attributes:
         path: directory of both.
-        demonstration_hash, annotation_hash: the content hashes that they must have.
+        demonstration_hash, annotation_hash: the content hashes that they must have; the latter is
+            `None` where there is no annotation.
     """
 
-    def __init__(self, path: Path, demonstration_hash: str, annotation_hash: str) -> None:
+    def __init__(self, path: Path, demonstration_hash: str, annotation_hash: str | None) -> None:
         self.path = path
         self.demonstration_hash, self.annotation_hash = demonstration_hash, annotation_hash
 
@@ -61,13 +62,15 @@ class Source:
         return demonstration
 
     @functools.cached_property
-    def annotation(self) -> Annotation:
-        """The precision spheres.
+    def annotation(self) -> Annotation | None:
+        """The precision spheres, or `None` where the dataset was made without.
 
         Raises:
             MissingFile, BrokenFile, InvalidInput: it can't be read.
             Mismatch: it isn't the one that the dataset was made with.
         """
+        if self.annotation_hash is None:
+            return None
         path = self.path / "annotation.json"
         annotation = load_annotation(path)
         _check_same(path, annotation.content_hash(), self.annotation_hash)

@@ -96,11 +96,11 @@ def entry_of(episode: Episode, content_hash: str) -> EpisodeEntry:
 class Manifest:
     """What a dataset was asked for, and how its attempts ended.
 
-    `sources` has for each demonstration its content hash and its annotation's; `request` is
-    whatever else decides what is generated.
+    `sources` has for each demonstration its content hash and its annotation's, `None` without one;
+    `request` is whatever else decides what is generated.
     """
 
-    sources: tuple[tuple[str, str], ...]
+    sources: tuple[tuple[str, str | None], ...]
     request: Mapping[str, Any]
     kept: dict[AttemptKey, EpisodeEntry] = field(default_factory=dict)
     rejected: dict[AttemptKey, Rejection] = field(default_factory=dict)

@@ -487,14 +487,17 @@ class Annotation:
         return summary(self, waypoints=[s.waypoint for s in self.spheres], radii=radii)
 
 
-def convergence_waypoint(demonstration: Demonstration, sphere: PrecisionSphere) -> int:
+def convergence_waypoint(
+    demonstration: Demonstration, sphere: PrecisionSphere, factor: float = 1.0
+) -> int:
     """t*: the first waypoint after the key waypoint that lies outside its sphere (paper, Eq. t*).
 
-    Where the demonstration never leaves the sphere the last waypoint is taken, as the published
-    code does.
+    With a `factor` it is the first that is farther than as many radii from the key pose. Where the
+    demonstration never is, the last waypoint is taken, as the published code does.
     """
     positions = demonstration.steps.measured_Ts_world_tool[:, :3, 3]
-    far = np.linalg.norm(positions - sphere.T_world_key[:3, 3], axis=1) > sphere.radius
+    distances = np.linalg.norm(positions - sphere.T_world_key[:3, 3], axis=1)
+    far = distances > factor * sphere.radius
     outside = np.flatnonzero(far[sphere.waypoint + 1 :])
     return sphere.waypoint + 1 + int(outside[0]) if len(outside) else len(demonstration) - 1
 
@@ -503,9 +506,10 @@ def convergence_waypoint(demonstration: Demonstration, sphere: PrecisionSphere) 
 class Provenance:
     """Where a generated episode comes from: enough to generate it again.
 
-    `source` is the number of its demonstration in the dataset, `sphere` that of its sphere in that
-    demonstration's annotation, `k` that of the attempt from the sphere. `recording`: whether the
-    segment's steps were recorded on the way out and reversed, or on the return.
+    `source` is the number of its demonstration in the dataset, `sphere` that of its sphere among
+    those that its strategy draws from there, `k` that of the attempt from the sphere. `merged`:
+    whether the demonstration follows from `t_star` on. `recording`: whether the segment's steps
+    were recorded on the way out and reversed, or on the return.
     """
 
     demonstration_hash: str
@@ -518,6 +522,7 @@ class Provenance:
     strategy: str
     distribution: str
     certificate: Mapping[str, Any] | None = None
+    merged: bool = True
     recording: Recording = "reversed"
 
     def __post_init__(self) -> None:
@@ -530,9 +535,10 @@ class Episode:
     """One generated trajectory: the segment's steps to t*, then the demonstration from `t_star`.
 
     The segment's last step is followed by the demonstration's step `provenance.t_star`; that
-    suffix is stored once, in the demonstration. `joint_path (m, n)` [rad]: the joints as they were
-    measured while the segment was executed, from t* outwards, and back again where the return was
-    recorded, at the backend's own rate.
+    suffix is stored once, in the demonstration. Where `provenance.merged` is false the trajectory
+    ends there. `joint_path (m, n)` [rad]: the joints as they were measured while the segment was
+    executed, from t* outwards, and back again where the return was recorded, at the backend's own
+    rate.
     """
 
     steps: Steps
@@ -553,14 +559,18 @@ class Episode:
 
     def commands(self, demonstration: Demonstration) -> tuple[Array, Array]:
         """Commanded tool poses `(n, 4, 4)` and gripper `(n,)` of the whole joined trajectory."""
-        t_star = self.provenance.t_star
-        suffix = demonstration.steps
+        after, suffix = self.suffix(demonstration), demonstration.steps
         return (
             np.concatenate(
-                [self.steps.commanded_Ts_world_tool, suffix.commanded_Ts_world_tool[t_star:]]
+                [self.steps.commanded_Ts_world_tool, suffix.commanded_Ts_world_tool[after]]
             ),
-            np.concatenate([self.steps.commanded_gripper, suffix.commanded_gripper[t_star:]]),
+            np.concatenate([self.steps.commanded_gripper, suffix.commanded_gripper[after]]),
         )
+
+    def suffix(self, demonstration: Demonstration) -> slice:
+        """The demonstration's steps that follow the segment, at least the one that it leads to."""
+        t_star = self.provenance.t_star
+        return slice(t_star, len(demonstration) if self.provenance.merged else t_star + 1)
 
     def actions(self, demonstration: Demonstration) -> Array:
         """Actions `(n, 7)` of the whole joined trajectory, see `actions_from_commands`."""

@@ -56,6 +56,20 @@ def sample_pose(sphere: PrecisionSphere, rng: np.random.Generator, config: Sampl
     return _pose_at(sphere, sphere.radius, rng, config)
 
 
+def sample_position(
+    sphere: PrecisionSphere, rng: np.random.Generator, config: SamplingConfig
+) -> Array:
+    """A tool pose `(4, 4)` on a precision sphere, turned as its key pose: R = C."""
+    T = sample_pose(sphere, rng, config)
+    T[:3, :3] = sphere.T_world_key[:3, :3]
+    return T
+
+
+def sample_turn(sphere: PrecisionSphere, rng: np.random.Generator, config: SamplingConfig) -> Array:
+    """A tool pose `(4, 4)` at a sphere's centre, p = c, turned as `sample_pose` turns it."""
+    return _pose_at(sphere, 0.0, rng, config)
+
+
 def sample_in_region(
     sphere: PrecisionSphere, rng: np.random.Generator, config: SamplingConfig
 ) -> Array:

@@ -51,7 +51,7 @@ class ManifestSource(msgspec.Struct, forbid_unknown_fields=True):
     """A demonstration and its annotation in a manifest, by their hashes."""
 
     demonstration: str
-    annotation: str
+    annotation: str | None
 
 
 class ManifestHead(msgspec.Struct, forbid_unknown_fields=True):
@@ -83,6 +83,8 @@ class Tally(msgspec.Struct):
     waypoint: Count
     kept: Count
     rejections: dict[str, Count]
+    # What was allocated to it at first.
+    wanted: Count | UnsetType = UNSET
 
 
 class DatasetFile(msgspec.Struct):

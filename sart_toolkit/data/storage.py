@@ -51,7 +51,7 @@ from sart_toolkit.errors import (
     SartError,
 )
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 
 # The largest files that are read as JSON, and as lines of JSON.
 MAX_JSON_BYTES = 16 * 2**20

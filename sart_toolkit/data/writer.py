@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sart_toolkit.data.dataset import (
     MANIFEST,
@@ -42,9 +42,23 @@ from sart_toolkit.data.storage import (
 )
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, OutputExists, SartError
 
+Sources = Sequence[tuple[Demonstration, Annotation | None]]
 
-def check_sources(sources: Sequence[tuple[Demonstration, Annotation]]) -> None:
-    """Return if a dataset can be made of demonstrations and their annotations.
+
+class SphereShare(NamedTuple):
+    """A sphere that trajectories were drawn from, its number in its source, and how many of them.
+
+    `wanted`: what was allocated to it at first, `None` if nobody noted it.
+    """
+
+    source: int
+    sphere: int
+    waypoint: int
+    wanted: int | None = None
+
+
+def check_sources(sources: Sources) -> None:
+    """Return if a dataset can be made of demonstrations and their annotations, if they have any.
 
     Raises:
         InvalidInput: there is none.
@@ -54,7 +68,8 @@ def check_sources(sources: Sequence[tuple[Demonstration, Annotation]]) -> None:
     if not sources:
         raise InvalidInput("sources: expected at least one demonstration, got none")
     for demonstration, annotation in sources:
-        annotation.check_matches(demonstration)
+        if annotation is not None:
+            annotation.check_matches(demonstration)
     for what in ("task", "robot"):
         found = sorted({getattr(demonstration, what) for demonstration, _ in sources})
         if len(found) > 1:
@@ -108,7 +123,7 @@ class DatasetWriter:
     def __init__(
         self,
         path: Path,
-        sources: Sequence[tuple[Demonstration, Annotation]],
+        sources: Sources,
         request: Mapping[str, Any],
         overwrite: bool = False,
     ) -> None:
@@ -129,7 +144,7 @@ class DatasetWriter:
         """
         check_sources(sources)
         self.path = path = Path(path)
-        hashes = tuple((d.content_hash(), a.content_hash()) for d, a in sources)
+        hashes = tuple((d.content_hash(), a.content_hash() if a else None) for d, a in sources)
         # As JSON gives it back, to be compared.
         wanted = Manifest(hashes, json.loads(json.dumps(dict(request))))
         lock = OutputLock(path)
@@ -197,10 +212,11 @@ class DatasetWriter:
         remove(self.path / SUMMARY)
         return None
 
-    def _save_sources(self, sources: Sequence[tuple[Demonstration, Annotation]]) -> None:
+    def _save_sources(self, sources: Sources) -> None:
         for source, (demonstration, annotation) in zip(self.sources, sources, strict=True):
             save_demonstration(source.path / "demo.h5", demonstration)
-            save_annotation(source.path / "annotation.json", annotation)
+            if annotation is not None:
+                save_annotation(source.path / "annotation.json", annotation)
 
     @property
     def n_kept(self) -> int:
@@ -231,6 +247,12 @@ class DatasetWriter:
         """Why the last attempt without an episode gave none."""
         return next(reversed(self._manifest.rejected.values()), None)
 
+    def count(self, source: int, sphere: int) -> tuple[int, int]:
+        """How many attempts from a sphere were kept so far, and how many were made."""
+        here = (source, sphere)
+        kept = sum(key[:2] == here for key in self._manifest.kept)
+        return kept, kept + sum(key[:2] == here for key in self._manifest.rejected)
+
     def missing(self, source: int, sphere: int, wanted: int, limit: int) -> list[AttemptKey]:
         """The attempts from a sphere by which `wanted` could be kept, no k beyond `limit`."""
         kept, rejected = self._manifest.kept, self._manifest.rejected
@@ -258,8 +280,14 @@ class DatasetWriter:
         self._journal.append(row)
         self._manifest.add(row)
 
-    def finish(self, info: Mapping[str, Any]) -> Dataset:
+    def finish(
+        self, info: Mapping[str, Any], spheres: Sequence[SphereShare] | None = None
+    ) -> Dataset:
         """The dataset as it is now, whole; `dataset.json` also says what `info` has.
+
+        Args:
+            info: what it says besides counts and hashes.
+            spheres: what trajectories were drawn from; the annotations' if left out.
 
         Raises:
             CannotWrite: the disk refuses.
@@ -272,11 +300,7 @@ class DatasetWriter:
             "n_kept": self.n_kept,
             "n_attempted": self.n_kept + self.n_rejected,
             "rejections": self.rejections,
-            "by_sphere": [
-                self._tally(source, sphere)
-                for source in range(len(self.sources))
-                for sphere in range(len(self.sources[source].annotation.spheres))
-            ],
+            "by_sphere": self.by_sphere(spheres),
             "least_commanded_clearance_m": min(clearances, default=None),
             "content_hash": manifest.content_hash(),
             "manifest_hash": manifest.whole_hash(),
@@ -285,16 +309,28 @@ class DatasetWriter:
         write_json(self.path / SUMMARY, summary)
         return load_dataset(self.path)
 
-    def _tally(self, source: int, sphere: int) -> dict[str, Any]:
-        """How the attempts from one sphere ended."""
-        here = (source, sphere)
-        manifest = self._manifest
-        return {
-            "source": source,
-            "waypoint": self.sources[source].annotation.spheres[sphere].waypoint,
-            "kept": sum(key[:2] == here for key in manifest.kept),
-            "rejections": _counted(r for key, r in manifest.rejected.items() if key[:2] == here),
-        }
+    def by_sphere(self, spheres: Sequence[SphereShare] | None = None) -> list[dict[str, Any]]:
+        """How the attempts from each sphere ended so far; the annotations' if left out."""
+        if spheres is None:
+            spheres = [
+                SphereShare(source, sphere, at.waypoint)
+                for source, found in enumerate(self.sources)
+                for sphere, at in enumerate(found.annotation.spheres if found.annotation else ())
+            ]
+        kept = collections.Counter(key[:2] for key in self._manifest.kept)
+        rejected: dict[tuple[int, int], list[Rejection]] = collections.defaultdict(list)
+        for key, rejection in self._manifest.rejected.items():
+            rejected[key[:2]].append(rejection)
+        return [
+            {
+                "source": share.source,
+                "waypoint": share.waypoint,
+                **({} if share.wanted is None else {"wanted": share.wanted}),
+                "kept": kept[share[:2]],
+                "rejections": _counted(rejected[share[:2]]),
+            }
+            for share in spheres
+        ]
 
 
 def _counted(rejections: Iterable[Rejection]) -> dict[str, int]:
@@ -325,7 +361,7 @@ def _short(value: Any) -> str:
 
 def write_dataset(
     path: Path,
-    sources: Sequence[tuple[Demonstration, Annotation]],
+    sources: Sources,
     episodes: Iterable[Episode],
     info: Mapping[str, Any],
 ) -> Dataset:

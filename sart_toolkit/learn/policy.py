@@ -89,6 +89,9 @@ class Policy(nn.Module, ABC):
         for name, value in vars(normalisation).items():
             getattr(self, name).copy_(torch.as_tensor(value))
 
+    def set_demonstration(self, actions: Tensor) -> None:
+        """Take over the actions `(T, 7)` of the first demonstration, in recorded units."""
+
     def load_backbone(self, path: Path) -> None:
         """Start from the weights in a file.
 

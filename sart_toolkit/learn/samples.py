@@ -307,8 +307,9 @@ def _trajectories(
         n = len(episode)
         commanded, gripper = episode.commands(demonstration)
         own_actions = actions_from_commands(commanded[: n + 1], gripper[: n + 1])[:n]
-        following = first + np.arange(t_star, len(demonstration))
-        yield episode.steps, following, np.concatenate([own_actions, actions[t_star:]])
+        # Where it isn't merged, the step that it leads to has no action of its own to learn.
+        after = np.arange(t_star, len(demonstration) if episode.provenance.merged else t_star)
+        yield episode.steps, first + after, np.concatenate([own_actions, actions[after]])
 
 
 def _clipped(n: int, around: NDArray[np.int64]) -> NDArray[np.int64]:

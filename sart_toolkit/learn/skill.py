@@ -26,7 +26,7 @@ from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, SartError
 from sart_toolkit.learn.frames import input_size, resize_area
 from sart_toolkit.learn.policy import Policy
 from sart_toolkit.learn.samples import remove_windows
-from sart_toolkit.learn.skillfiles import check_directory, load_files, write_config
+from sart_toolkit.learn.skillfiles import ANNOTATION, check_directory, load_files, write_config
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.training import (
     CHECKPOINT,
@@ -160,7 +160,7 @@ class Skill:
     Attributes:
         config: what must be known to execute it elsewhere.
         demonstration: the demonstration it came from.
-        annotation: the annotation it came from.
+        annotation: the annotation it came from, `None` where there was none.
         training: its training curve, speed and versions, as `training.json` has them.
     """
 
@@ -169,7 +169,7 @@ class Skill:
         policy: Policy,
         config: SkillConfig,
         demonstration: Demonstration,
-        annotation: Annotation,
+        annotation: Annotation | None,
         training: Mapping[str, Any],
         device: str = "cpu",
     ) -> None:
@@ -326,7 +326,9 @@ def _write_skill(
         references=demonstration.references,
     )
     storage.save_demonstration(path / "demo.h5", demonstration)
-    storage.save_annotation(path / "annotation.json", source.annotation)
+    storage.remove(path / ANNOTATION)
+    if source.annotation is not None:
+        storage.save_annotation(path / ANNOTATION, source.annotation)
     training = {
         "curve": [dataclasses.asdict(record) for record in result.curve],
         "final_loss": result.final_loss,

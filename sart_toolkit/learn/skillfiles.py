@@ -27,13 +27,14 @@ class SkillFiles:
     Attributes:
         config: `config.json`, without the hashes of the files.
         training: `training.json`.
-        demonstration, annotation: what it was made from.
+        demonstration, annotation: what it was made from; the annotation is `None` where it was
+            made without.
     """
 
     config: Mapping[str, Any]
     training: Mapping[str, Any]
     demonstration: Demonstration
-    annotation: Annotation
+    annotation: Annotation | None
 
 
 def write_config(path: Path, config: Mapping[str, Any]) -> None:
@@ -43,7 +44,7 @@ def write_config(path: Path, config: Mapping[str, Any]) -> None:
         MissingFile, BrokenFile: one of them can't be read.
         CannotWrite: the disk refuses.
     """
-    hashes = _hashes(path, *_parts(path))
+    hashes = _hashes(path, *_parts(path, (path / ANNOTATION).exists()))
     write_json(path / CONFIG, {**config, "files": hashes})
 
 
@@ -68,11 +69,11 @@ def load_files(path: Path) -> SkillFiles:
     check_directory(path)
     config = read_json(path / CONFIG, SkillFile)
     expected = config.pop("files")
-    demonstration, annotation, training = _parts(path)
-    for name, found in (
-        (DEMONSTRATION, demonstration.content_hash()),
-        (ANNOTATION, annotation.demonstration_hash),
-    ):
+    demonstration, annotation, training = _parts(path, ANNOTATION in expected)
+    of = {DEMONSTRATION: demonstration.content_hash()}
+    if annotation is not None:
+        of[ANNOTATION] = annotation.demonstration_hash
+    for name, found in of.items():
         if found != config["demonstration_hash"]:
             raise Mismatch(
                 f"{path / name}: belongs to another demonstration than {CONFIG}; copy the whole "
@@ -87,16 +88,19 @@ def load_files(path: Path) -> SkillFiles:
     return SkillFiles(config, training, demonstration, annotation)
 
 
-def _parts(path: Path) -> tuple[Demonstration, Annotation, dict[str, Any]]:
+def _parts(path: Path, annotated: bool) -> tuple[Demonstration, Annotation | None, dict[str, Any]]:
     return (
         load_demonstration(path / DEMONSTRATION),
-        load_annotation(path / ANNOTATION),
+        load_annotation(path / ANNOTATION) if annotated else None,
         read_json(path / TRAINING, TrainingFile),
     )
 
 
 def _hashes(
-    path: Path, demonstration: Demonstration, annotation: Annotation, training: Mapping[str, Any]
+    path: Path,
+    demonstration: Demonstration,
+    annotation: Annotation | None,
+    training: Mapping[str, Any],
 ) -> dict[str, str]:
     if not (path / MODEL).is_file():
         raise MissingFile(f"{path / MODEL}: no such file; check the path, or train again")
@@ -104,7 +108,7 @@ def _hashes(
         model = hashlib.file_digest(file, "sha256").hexdigest()
     return {
         DEMONSTRATION: demonstration.content_hash(),
-        ANNOTATION: annotation.content_hash(),
+        **({} if annotation is None else {ANNOTATION: annotation.content_hash()}),
         TRAINING: digest(training),
         MODEL: model,
     }

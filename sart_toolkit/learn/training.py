@@ -288,7 +288,10 @@ def train(
             remove(out / CHECKPOINT)
         windows = open_windows(dataset, _window_config(config), out, reading)
         with torch_threads(config.threads), _deferred_interrupt() as interrupt:
-            return _Training(windows, config, out, device).run(progress, interrupt)
+            training = _Training(windows, config, out, device)
+            actions = dataset.sources[0].demonstration.actions
+            training.policy.set_demonstration(torch.from_numpy(actions))
+            return training.run(progress, interrupt)
 
 
 def _window_config(config: TrainConfig) -> WindowConfig:

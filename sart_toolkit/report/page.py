@@ -83,11 +83,18 @@ def write_report(run_dir: Path, out: Path) -> None:
 
 @dataclass(frozen=True)
 class _Run:
-    """The parts of a run; `None` for those that aren't there."""
+    """The parts of a run; `None` for those that aren't there.
+
+    Of several demonstrations, `demonstrations` in number, the first is shown with its annotation
+    and its paths; `demonstrating` and `annotating` [s] are a person's time for all of them.
+    """
 
     directory: Path
     demonstration: Demonstration | None
     annotation: Annotation | None
+    demonstrations: int
+    demonstrating: float
+    annotating: float
     augmentation: Mapping[str, Any] | None
     paths: Sequence[SegmentPath]
     proofs: Sequence[Mapping[str, Any]]
@@ -112,13 +119,32 @@ def _load_run(directory: Path) -> _Run:
     paths: list[SegmentPath] = []
     proofs: list[Mapping[str, Any]] = []
     for episode in dataset if dataset is not None else ():
-        paths += segment_paths([episode])
+        if episode.provenance.source == 0:
+            paths += segment_paths([episode])
         if episode.provenance.certificate is not None:
             proofs.append(episode.provenance.certificate)
+    demonstration = optional("demo.h5", load_demonstration)
+    annotation = optional("annotation.json", load_annotation)
+    several = sorted((directory / "demos").glob("demo*.h5"))
+    demonstrating = annotating = 0.0
+    for shown, spheres in (
+        *([] if demonstration is None else [(demonstration, annotation)]),
+        *(
+            (load_demonstration(p), optional(f"demos/{p.stem}.json", load_annotation))
+            for p in several
+        ),
+    ):
+        demonstration, annotation = demonstration or shown, annotation or spheres
+        demonstrating += shown.seconds if shown.steered_by_person else 0.0
+        if spheres is not None and any(sphere.source == "human" for sphere in spheres.spheres):
+            annotating += spheres.seconds
     run = _Run(
         directory=directory,
-        demonstration=optional("demo.h5", load_demonstration),
-        annotation=optional("annotation.json", load_annotation),
+        demonstration=demonstration,
+        annotation=annotation,
+        demonstrations=len(several) or 1,
+        demonstrating=demonstrating,
+        annotating=annotating,
         augmentation=dataset.info if dataset is not None else None,
         paths=paths,
         proofs=proofs,
@@ -251,22 +277,22 @@ def _tiles(run: _Run) -> list[Shown]:
     if run.demonstration is not None:
         d = run.demonstration
         steps = f"{len(d)} steps over {duration(float(d.timestamps[-1] - d.timestamps[0]))}"
-        tile("Demonstrations", "1", steps, f"steered by {d.operator}")
+        if run.demonstrations > 1:
+            steps = f"the first with {steps}"
+        tile("Demonstrations", str(run.demonstrations), steps, f"steered by {d.operator}")
         by_hand = run.annotation is not None and any(
             sphere.source == "human" for sphere in run.annotation.spheres
         )
-        annotating = run.annotation.seconds if run.annotation is not None and by_hand else 0.0
-        demonstrating = d.seconds if d.steered_by_person else 0.0
         notes = [
-            f"{duration(demonstrating)} demonstrating"
+            f"{duration(run.demonstrating)} demonstrating"
             if d.steered_by_person
             else "no demonstrating: a script steered"
         ]
         if by_hand:
-            notes.append(f"{duration(annotating)} annotating")
+            notes.append(f"{duration(run.annotating)} annotating")
         elif run.annotation is not None:
             notes.append("no annotating: radii suggested by the toolkit")
-        human = demonstrating + annotating
+        human = run.demonstrating + run.annotating
         tile("Human time", duration(human) if human else "none", *notes)
     if run.augmentation is not None:
         kept, attempted = _counts(run.augmentation)
@@ -329,13 +355,19 @@ def _spheres(run: _Run) -> Shown | str:
         return f"No {name} in this run: there are no precision spheres to draw."
     demonstration, annotation, paths = run.demonstration, run.annotation, run.paths
     annotation.check_matches(demonstration)
+    if run.augmentation is not None:
+        rows = _field(run.augmentation, "dataset.json", "by_sphere")
+        drawn = [row["waypoint"] for row in rows if row["source"] == 0]
+        if drawn != [sphere.waypoint for sphere in annotation.spheres]:
+            # By a strategy that has spheres of its own.
+            paths = ()
 
     def draw(theme: Theme) -> bytes:
         return scene_image(demonstration, annotation, paths, theme)
 
     counts = collections.Counter(path.sphere for path in paths)
     times = demonstration.timestamps - demonstration.timestamps[0]
-    rows = [
+    shown = [
         {
             "colour": sphere_colour(i),
             "waypoint": sphere.waypoint,
@@ -349,10 +381,10 @@ def _spheres(run: _Run) -> Shown | str:
         for i, sphere in enumerate(annotation.spheres)
     ]
     alt = (
-        f"Two 3D views of the demonstrated tool path with {_plural(len(rows), 'precision sphere')}"
+        f"Two 3D views of the demonstrated tool path with {_plural(len(shown), 'precision sphere')}"
         + (f" and {_plural(len(paths), 'augmented path')} leading back to it" if paths else "")
     )
-    return {"drawing": _drawn(draw, alt), "spheres": rows}
+    return {"drawing": _drawn(draw, alt), "spheres": shown}
 
 
 def _augmentation(run: _Run) -> Shown | str:
@@ -402,6 +434,9 @@ def _training(run: _Run) -> Shown | str:
         raise BrokenFile(f"{file}: its curve has no epoch; train the skill again")
     epochs = [float(_field(row, file, "epoch")) for row in curve]
     losses = [float(_field(row, file, "loss")) for row in curve]
+
+    if not any(losses):
+        return "Nothing was learned: the policy has no loss to lower."
 
     def draw(theme: Theme) -> bytes:
         return training_curve(epochs, losses, theme)

@@ -58,7 +58,7 @@ class Playback:
         Args:
             title: what it is called.
             demonstration: the recorded demonstration.
-            episode: its segment is played first, then the demonstration from `t_star`.
+            episode: its segment is played first, then what follows of the demonstration.
 
         Raises:
             InvalidInput: no images were recorded.
@@ -69,7 +69,7 @@ class Playback:
         if episode is not None:
             self.split = len(episode)
             segment = [(episode.steps, i) for i in range(len(episode))]
-            self._parts = segment + self._parts[episode.provenance.t_star :]
+            self._parts = segment + self._parts[episode.suffix(demonstration)]
         self._first = 0 if episode is None else episode.provenance.t_star
         cameras = list(demonstration.steps.cameras)
         if not cameras:

@@ -174,7 +174,7 @@ def test_every_pose_that_augmentation_draws_keeps_the_whole_robot_clear(
         for i in range(60):
             radius = sphere.radius * (1.0 if i % 2 else rng.uniform())
             drawn = dataclasses.replace(sphere, radius=max(radius, 1e-6))
-            T = SART.propose(peg_demonstration, drawn, rng, SamplingConfig()).T_world_sampled
+            T = SART.propose(peg_demonstration, [drawn], 0, rng, SamplingConfig()).T_world_sampled
             distances = placed.distances(placed.kinematics.ik(T, near))
             assert distances[placed.tool_pairs()].min() >= margin - 1e-6
             assert distances.min() >= 0

@@ -6,7 +6,6 @@ import dataclasses
 import json
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from sart_toolkit.annotate.suggest import SuggestConfig
@@ -46,39 +45,7 @@ def test_a_negative_length_is_refused(name):
         AugmentConfig(**{name: -0.1})
 
 
-@given(radii=radii, n=numbers)
-def test_equal_allocation_goes_round_robin(radii, n):
-    expected = [len(range(i, n - 1, len(radii))) for i in range(len(radii))]
-    assert AugmentConfig(n, allocation="equal").quotas(radii) == expected
-
-
-@given(radii=radii, n=numbers)
-def test_the_allocation_follows_the_radii(radii, n):
-    quotas = AugmentConfig(n).quotas(radii)
-    assert sum(quotas) == n - 1
-    # Nobody could hand a trajectory on to a sphere that has fewer for its radius.
-    for a, r_a in zip(quotas, radii, strict=True):
-        for b, r_b in zip(quotas, radii, strict=True):
-            assert a == 0 or r_a / (2 * a - 1) >= r_b / (2 * b + 1) * (1 - 1e-12)
-
-
-@given(radii=radii, n=numbers)
-def test_more_trajectories_take_none_away(radii, n):
-    fewer, more = (AugmentConfig(m).quotas(radii) for m in (n, n + 1))
-    assert all(a <= b for a, b in zip(fewer, more, strict=True))
-
-
-def test_demonstrations_count_among_the_trajectories():
-    assert sum(AugmentConfig(40).quotas([0.1, 0.2], demonstrations=3)) == 37
-    with pytest.raises(InvalidInput, match="n: expected more than the 3 demonstrations, got 3"):
-        AugmentConfig(3).quotas([0.1], demonstrations=3)
-
-
 def test_settings_survive_json():
     config = AugmentConfig(7, "equal", SART_PLANNED, SamplingConfig("area", 1.0), 1.5, seed=3)
     again = AugmentConfig.from_json(json.loads(json.dumps(config.to_json())))
     assert again == dataclasses.replace(config, strategy="sart_planned")
-
-
-def test_a_wide_sphere_gets_most():
-    assert AugmentConfig(40).quotas([0.122, 0.005, 0.004, 0.0075]) == [35, 1, 1, 2]

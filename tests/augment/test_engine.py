@@ -15,7 +15,8 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from sart_toolkit.augment import STRATEGIES, engine
+from sart_toolkit.augment import STRATEGIES, engine, get_strategy
+from sart_toolkit.augment.allocation import allocate
 from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration, augment_sources
 from sart_toolkit.augment.executors import Attempt, RestoreExecutor
@@ -76,7 +77,7 @@ def crowded_dataset(peg_demonstration, crowded, make_peg_backend, tmp_path_facto
     return augment_demonstration(peg_demonstration, crowded, make_peg_backend, out, CROWDED)
 
 
-@pytest.fixture(scope="module", params=STRATEGIES)
+@pytest.fixture(scope="module", params=[n for n in STRATEGIES if n not in ("bc", "replay")])
 def strategy_dataset(
     request, peg_demonstration, peg_annotation, make_peg_backend, tmp_path_factory
 ):
@@ -114,17 +115,15 @@ def test_a_commanded_pose_followed_by_its_action_is_the_next_commanded_pose(stra
     for episode in strategy_dataset:
         Ts, gripper = episode.commands(demonstration)
         actions = episode.actions(demonstration)
-        assert (
-            len(Ts)
-            == len(actions)
-            == len(episode) + len(demonstration) - (episode.provenance.t_star)
-        )
+        p = episode.provenance
+        follows = len(demonstration) - p.t_star if p.merged else 1
+        assert len(Ts) == len(actions) == len(episode) + follows
         for t in range(len(Ts) - 1):
             T, g = apply_action(Ts[t], actions[t])
             np.testing.assert_allclose(T, Ts[t + 1], rtol=0, atol=1e-9)
             assert g == gripper[t + 1]
         assert not actions[-1, :6].any()
-        suffix = demonstration.steps.commanded_Ts_world_tool[episode.provenance.t_star :]
+        suffix = demonstration.steps.commanded_Ts_world_tool[p.t_star :][:follows]
         np.testing.assert_array_equal(Ts[len(episode) :], suffix)
 
 
@@ -150,12 +149,18 @@ def test_a_segment_is_commanded_along_the_straight_line_from_the_sampled_pose_to
 def test_an_episode_says_where_it_comes_from(strategy_dataset, peg_annotation):
     demonstration = strategy_dataset.sources[0].demonstration
     config = strategy_dataset.info["config"]
+    strategy = get_strategy(config["strategy"])
+    spheres = strategy.spheres(demonstration, peg_annotation)
     for episode in strategy_dataset:
         p = episode.provenance
-        sphere = peg_annotation.spheres[p.sphere]
         assert p.demonstration_hash == demonstration.content_hash()
         assert p.strategy == config["strategy"] and p.seed == config["seed"]
-        assert sphere.waypoint < p.t_star < len(demonstration)
+        assert spheres[p.sphere].waypoint <= p.t_star < len(demonstration)
+        rows = strategy_dataset.info["by_sphere"]
+        assert rows[p.sphere]["waypoint"] == spheres[p.sphere].waypoint
+    assert [row["kept"] for row in rows] == [
+        sum(entry.sphere == i for entry in strategy_dataset.index) for i in range(len(spheres))
+    ]
 
 
 def test_by_the_paper_s_strategy_an_episode_starts_on_its_sphere_and_joins_at_t_star(
@@ -237,7 +242,8 @@ def test_every_sphere_gets_its_quota(peg_annotation, augment, tmp_path, allocati
     dataset = augment(peg_annotation, tmp_path / "d", config)
     made = Counter(episode.provenance.sphere for episode in dataset)
     spheres = peg_annotation.spheres
-    assert [made[i] for i in range(len(spheres))] == config.quotas([s.radius for s in spheres])
+    weights = get_strategy("sart").weights(spheres, allocation)
+    assert [made[i] for i in range(len(spheres))] == allocate(9, weights)
 
 
 def test_attempts_that_would_touch_are_rejected_and_counted_by_what_touched(crowded_dataset):
@@ -319,18 +325,35 @@ def test_joint_velocities_of_an_episode_are_those_of_its_own_motion(peg_dataset)
         np.testing.assert_array_equal(np.sign(moved)[fast], np.sign(dq[1:])[fast])
 
 
-def test_a_sphere_that_gives_nothing_leaves_fewer_trajectories_and_a_warning(
+def test_what_a_sphere_cannot_give_is_asked_of_the_others_and_said_with_the_reason(
     annotate, augment, tmp_path, caplog
 ):
     with caplog.at_level(logging.WARNING):
         dataset = augment(
             annotate((0, 0.01), (34, 1.5)),
             tmp_path / "d",
-            AugmentConfig(n=3, duration=0.5, allocation="equal"),
+            AugmentConfig(n=5, duration=0.5, allocation="equal"),
         )
-    assert [episode.provenance.sphere for episode in dataset] == [0]
-    assert "only 1 of 2 trajectories were kept (" in caplog.text
+    assert [episode.provenance.sphere for episode in dataset] == [0, 0, 0, 0]
+    assert "sphere at waypoint 34 of demonstration 0 gave 0 of 2 trajectories (" in caplog.text
+    assert "trajectories were kept" not in caplog.text, "all that were asked for"
+    assert [row["wanted"] for row in dataset.info["by_sphere"]] == [2, 2]
     assert sum(dataset.info["rejections"].values()) == 20
+
+
+def test_what_no_sphere_can_give_leaves_fewer_trajectories_and_a_warning(
+    annotate, augment, tmp_path, caplog, monkeypatch
+):
+    monkeypatch.setattr(engine, "_LEAST_ATTEMPTS", 3)
+    monkeypatch.setattr(engine, "_ATTEMPTS_PER_EPISODE", 1)
+    spheres = annotate((0, 0.01), (34, 1.5))
+    with caplog.at_level(logging.WARNING):
+        dataset = augment(
+            spheres, tmp_path / "d", AugmentConfig(n=11, duration=0.5, allocation="equal")
+        )
+    # Of five attempts each all of one sphere and none of the other are kept.
+    assert [row["kept"] for row in dataset.info["by_sphere"]] == [5, 0]
+    assert "only 5 of 10 trajectories were kept (" in caplog.text
 
 
 def test_when_every_attempt_is_rejected_the_error_counts_the_reasons(annotate, augment, tmp_path):
@@ -831,6 +854,29 @@ def test_a_demonstration_s_episodes_do_not_depend_on_those_after_it(
     alone = augment_sources(two_sources[:1], make_peg_backend, tmp_path / "alone", config)
     of_first = [entry.content_hash for entry in both.index if entry.source == 0]
     assert of_first == [entry.content_hash for entry in alone.index]
+
+
+def test_by_a_strategy_that_draws_nothing_the_dataset_is_its_demonstrations(
+    two_sources, make_peg_backend, tmp_path
+):
+    sources = [(demonstration, None) for demonstration, _ in two_sources]
+    config = AugmentConfig(n=2, strategy="bc", cameras=())
+    dataset = augment_sources(sources, make_peg_backend, tmp_path / "d", config)
+    assert len(dataset) == 0 and dataset.info["n_trajectories"] == 2
+    assert [source.annotation for source in dataset.sources] == [None, None]
+    for source, (demonstration, _) in zip(dataset.sources, sources, strict=True):
+        assert source.demonstration.content_hash() == demonstration.content_hash()
+    with pytest.raises(InvalidInput, match=r"'bc' draws nothing.*demonstrations \(2\), got 3"):
+        augment_sources(sources, make_peg_backend, tmp_path / "e", dataclasses.replace(config, n=3))
+
+
+def test_a_strategy_that_draws_from_annotations_is_refused_without_one(
+    two_sources, make_peg_backend, tmp_path
+):
+    sources = [two_sources[0], (two_sources[1][0], None)]
+    with pytest.raises(InvalidInput, match="demonstration has none; make one with `sart suggest`"):
+        augment_sources(sources, make_peg_backend, tmp_path / "d", AugmentConfig(n=5))
+    assert not (tmp_path / "d").exists()
 
 
 # --- executors ----------------------------------------------------------------------------------

@@ -9,9 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sart_toolkit.augment import get_strategy
-from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.strategies import SART, SART_PLANNED, Proposal, Strategy
+from sart_toolkit.augment import STRATEGIES, get_strategy
+from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
+from sart_toolkit.augment.strategies import (
+    SART,
+    SART_PLANNED,
+    ContactFreeMiles,
+    Proposal,
+    Strategy,
+)
 from sart_toolkit.data.records import Demonstration, PrecisionSphere, Steps, convergence_waypoint
 from sart_toolkit.data.sampling import (
     DISTRIBUTIONS,
@@ -138,7 +144,8 @@ def test_the_sampled_pose_lies_on_the_sphere_turned_by_no_more_than_allowed(
     sphere = PrecisionSphere(0, pose(centre, turn), radius)
     config = SamplingConfig(distribution, nu)
     drawn = [
-        SART.propose(demonstration, sphere, np.random.default_rng(seed), config) for _ in range(2)
+        SART.propose(demonstration, [sphere], 0, np.random.default_rng(seed), config)
+        for _ in range(2)
     ]
     T = drawn[0].T_world_sampled
     np.testing.assert_array_equal(T, drawn[1].T_world_sampled)
@@ -155,7 +162,9 @@ def test_the_rotation_is_drawn_for_the_radius_of_the_sphere():
         angles = [
             angle_between(
                 np.eye(3),
-                SART.propose(demonstration, sphere, rng, SamplingConfig()).T_world_sampled[:3, :3],
+                SART.propose(demonstration, [sphere], 0, rng, SamplingConfig()).T_world_sampled[
+                    :3, :3
+                ],
             )
             for _ in range(3000)
         ]
@@ -177,7 +186,7 @@ def test_t_star_is_the_first_waypoint_after_the_key_outside_its_sphere(path, rad
         if np.linalg.norm(np.subtract(path[t], path[waypoint])) > radius:
             expected = t
     assert convergence_waypoint(demonstration, sphere) == expected
-    proposal = SART.propose(demonstration, sphere, np.random.default_rng(0), SamplingConfig())
+    proposal = SART.propose(demonstration, [sphere], 0, np.random.default_rng(0), SamplingConfig())
     assert proposal.t_star == expected
 
 
@@ -190,9 +199,12 @@ def test_a_demonstration_that_never_leaves_a_sphere_is_joined_at_its_last_waypoi
 def test_every_strategy_rejoins_ahead_of_its_sphere_and_follows_from_the_rng(
     strategy, peg_demonstration, peg_annotation
 ):
-    for sphere in peg_annotation.spheres:
+    spheres = peg_annotation.spheres
+    for i, sphere in enumerate(spheres):
         drawn = [
-            strategy.propose(peg_demonstration, sphere, np.random.default_rng(3), SamplingConfig())
+            strategy.propose(
+                peg_demonstration, spheres, i, np.random.default_rng(3), SamplingConfig()
+            )
             for _ in range(2)
         ]
         assert sphere.waypoint < drawn[0].t_star < len(peg_demonstration)
@@ -208,7 +220,7 @@ def _distances(region, distribution, n=3000):
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
     rng = np.random.default_rng(5)
     drawn = [
-        SART_PLANNED.propose(demonstration, region, rng, SamplingConfig(distribution))
+        SART_PLANNED.propose(demonstration, [region], 0, rng, SamplingConfig(distribution))
         for _ in range(n)
     ]
     offsets = np.array([d.T_world_sampled[:3, 3] for d in drawn]) - region.T_world_key[:3, 3]
@@ -235,7 +247,7 @@ def test_the_paper_s_strategy_draws_from_the_surface_of_a_sphere_of_either_kind(
     demonstration = _demonstration([[0, 0, 0], [9, 9, 9]])
     sphere = PrecisionSphere(0, pose([0.1, 0, 0]), 0.25, kind=kind)
     T = SART.propose(
-        demonstration, sphere, np.random.default_rng(1), SamplingConfig()
+        demonstration, [sphere], 0, np.random.default_rng(1), SamplingConfig()
     ).T_world_sampled
     assert np.linalg.norm(T[:3, 3] - [0.1, 0, 0]) == pytest.approx(0.25, abs=1e-12)
 
@@ -245,7 +257,7 @@ def test_in_a_ball_the_strategy_that_plans_draws_what_the_paper_s_does(distribut
     sphere, config = PrecisionSphere(0, pose([0.1, 0, 0]), 0.2), SamplingConfig(distribution)
     for seed in range(5):
         a, b = (
-            strategy.propose(demonstration, sphere, np.random.default_rng(seed), config)
+            strategy.propose(demonstration, [sphere], 0, np.random.default_rng(seed), config)
             for strategy in (SART, SART_PLANNED)
         )
         assert a.t_star == b.t_star
@@ -253,14 +265,161 @@ def test_in_a_ball_the_strategy_that_plans_draws_what_the_paper_s_does(distribut
 
 
 def test_only_the_planned_strategy_plans():
-    assert not SART.plans and SART_PLANNED.plans
+    assert [name for name in STRATEGIES if get_strategy(name).plans] == ["sart_planned"]
+
+
+# --- ablations and baselines, each from its definition ------------------------------------------
+
+# A straight way along x, a waypoint each centimetre, and two spheres on it.
+LINE = _demonstration([[0.01 * t, 0, 0] for t in range(31)])
+PAIR = tuple(
+    PrecisionSphere(t, LINE.steps.measured_Ts_world_tool[t], radius)
+    for t, radius in ((4, 0.035), (12, 0.055))
+)
+
+
+def _drawn(name, i=0, n=200, spheres=PAIR):
+    strategy, rng = get_strategy(name), np.random.default_rng(4)
+    return [strategy.propose(LINE, spheres, i, rng, SamplingConfig()) for _ in range(n)]
+
+
+def _offsets(proposals, sphere):
+    """Distance of each from the sphere's centre [m], and the angle between them [rad]."""
+    key = sphere.T_world_key
+    Ts = [proposal.T_world_sampled for proposal in proposals]
+    return (
+        np.array([np.linalg.norm(T[:3, 3] - key[:3, 3]) for T in Ts]),
+        np.array([angle_between(key[:3, :3], T[:3, :3]) for T in Ts]),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "joins"),
+    [
+        # Waypoint 4 is left behind 35 mm away: at 8; 12 behind 55 mm: at 18.
+        ("sart", (8, 18)),
+        ("sart_planned", (8, 18)),
+        ("no_position", (8, 18)),
+        ("no_orientation", (8, 18)),
+        ("no_merge", (8, 18)),
+        ("inside_sphere", (8, 18)),
+        # kappa*_i = kappa_i.
+        ("return_to_center", (4, 12)),
+        # c_(i+1); there is none after the last.
+        ("next_sphere_center", (12, 18)),
+        # kappa*_(i+1).
+        ("next_sphere_convergence", (18, 18)),
+        # Farther than 2 r: 70 mm after 40 mm is 120 mm, 110 after 120 is 230 mm.
+        ("extended_convergence", (12, 24)),
+    ],
+)
+def test_a_strategy_rejoins_where_it_is_defined_to(name, joins):
+    if name == "sart_planned":
+        pytest.importorskip("ompl")
+    for i, expected in enumerate(joins):
+        if name == "extended_convergence":
+            # Rounding decides what lies exactly on the sphere.
+            assert _drawn(name, i, 1)[0].t_star in (expected, expected - 1)
+        else:
+            assert _drawn(name, i, 1)[0].t_star == expected
+
+
+def test_every_other_strategy_is_tested_by_a_definition_of_its_own():
+    tested = {"miles", "miles_1cm", "miles_10cm", "bc", "replay"}
+    mark = next(
+        mark
+        for mark in test_a_strategy_rejoins_where_it_is_defined_to.pytestmark
+        if mark.name == "parametrize"
+    )
+    assert {name for name, _ in mark.args[1]} | tested == set(STRATEGIES)
+
+
+def test_without_position_augmentation_poses_are_the_centre_turned():
+    distances, angles = _offsets(_drawn("no_position"), PAIR[0])
+    assert distances.max() < 1e-12
+    assert _fits(angles, stats.uniform(0, 2.0 * PAIR[0].radius))
+
+
+def test_without_orientation_augmentation_poses_lie_on_the_sphere_unturned():
+    drawn = _drawn("no_orientation")
+    distances, angles = _offsets(drawn, PAIR[0])
+    np.testing.assert_allclose(distances, PAIR[0].radius, atol=1e-12)
+    assert angles.max() == 0.0
+    for ours, sart in zip(drawn[:1], _drawn("sart")[:1], strict=True):
+        np.testing.assert_array_equal(ours.T_world_sampled[:3, 3], sart.T_world_sampled[:3, 3])
+
+
+def test_inside_the_sphere_poses_fill_its_volume():
+    distances, angles = _offsets(_drawn("inside_sphere", n=2000), PAIR[0])
+    assert _fits((distances / PAIR[0].radius) ** 3, stats.uniform(0, 1))
+    assert _fits(angles, stats.uniform(0, 2.0 * PAIR[0].radius))
+
+
+def test_only_without_merging_nothing_follows():
+    for name in ("sart", "no_merge", "return_to_center", "miles"):
+        assert all(p.merged == (name != "no_merge") for p in _drawn(name, n=3))
+
+
+def test_where_spheres_tile_the_path_the_next_centre_is_the_convergence_waypoint():
+    """As the paper says of its own annotations: then the ablation is SART."""
+    at = LINE.steps.measured_Ts_world_tool
+    tiling = [PrecisionSphere(2, at[2], 0.045)]
+    for radius in (0.035, 0.025):
+        t = convergence_waypoint(LINE, tiling[-1])
+        tiling.append(PrecisionSphere(t, at[t], radius))
+    for i in range(3):
+        ours, sart = (_drawn(n, i, 5, tiling) for n in ("next_sphere_center", "sart"))
+        assert [p.t_star for p in ours] == [p.t_star for p in sart]
+
+
+@pytest.mark.parametrize(
+    ("name", "radius"), [("miles", 0.02), ("miles_1cm", 0.01), ("miles_10cm", 0.1)]
+)
+def test_contact_free_miles_has_a_sphere_at_every_waypoint_and_returns_to_its_centre(name, radius):
+    strategy = get_strategy(name)
+    spheres = strategy.spheres(LINE, None)
+    assert [sphere.waypoint for sphere in spheres] == list(range(len(LINE) - 1))
+    assert {sphere.radius for sphere in spheres} == {radius}
+    for sphere, T in zip(spheres, LINE.steps.measured_Ts_world_tool, strict=False):
+        np.testing.assert_array_equal(sphere.T_world_key, T)
+    for i in (0, 9, len(spheres) - 1):
+        drawn = _drawn(name, i, 20, spheres)
+        assert {proposal.t_star for proposal in drawn} == {i}
+        np.testing.assert_allclose(_offsets(drawn, spheres[i])[0], radius, atol=1e-12)
+    # All waypoints alike, by either allocation.
+    for allocation in ALLOCATIONS:
+        assert len(set(strategy.weights(spheres, allocation))) == 1
+
+
+def test_a_radius_that_is_none_is_refused():
+    with pytest.raises(InvalidInput, match="radius"):
+        ContactFreeMiles(radius=0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "policy", "n"), [("bc", "compact_mlp", 40), ("replay", "replay", 1)]
+)
+def test_behavioural_cloning_and_replay_draw_nothing(name, policy, n):
+    strategy = get_strategy(name)
+    assert not strategy.draws and strategy.spheres(LINE, None) == ()
+    assert (strategy.policy, strategy.n) == (policy, n)
+    with pytest.raises(InvalidInput, match="draws no segments; use another, such as sart"):
+        _drawn(name, n=1)
+
+
+def test_weights_follow_the_radii_or_are_equal():
+    assert list(SART.weights(PAIR, "radius")) == [0.035, 0.055]
+    assert list(SART.weights(PAIR, "equal")) == [1.0, 1.0]
+
+
+# --- a strategy of one's own --------------------------------------------------------------------
 
 
 class Still(Strategy):
     """A strategy from outside: stay at the key pose."""
 
-    def propose(self, demonstration, sphere, rng, config):
-        return Proposal(sphere.waypoint + 1, sphere.T_world_key)
+    def propose(self, demonstration, spheres, i, rng, config):
+        return Proposal(spheres[i].waypoint + 1, spheres[i].T_world_key)
 
 
 def test_a_strategy_of_one_s_own_is_taken_as_it_is_and_noted_by_its_reference():

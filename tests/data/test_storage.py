@@ -325,7 +325,9 @@ def test_a_file_of_another_kind_is_reported_with_both_kinds(tmp_path):
         load_demonstration(tmp_path / "episode.h5")
     with h5py.File(tmp_path / "other.h5", "w"):
         pass
-    with pytest.raises(BrokenFile, match="older than 5, or the file is not of sart_toolkit; rec"):
+    with pytest.raises(
+        BrokenFile, match=f"older than {SCHEMA_VERSION}, or the file is not of sart_toolkit; rec"
+    ):
         load_demonstration(tmp_path / "other.h5")
 
 

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -9,7 +10,8 @@ from sart_toolkit.learn.policies.compact_mlp import CompactEncoder
 from sart_toolkit.learn.policies.encoder import read_state_dict
 from sart_toolkit.learn.policies.resnet18_mlp import ResNet18
 from sart_toolkit.learn.policy import Policy
-from sart_toolkit.learn.training import TrainConfig, build_policy
+from sart_toolkit.learn.skill import load_skill, save_skill
+from sart_toolkit.learn.training import TrainConfig, build_policy, train
 
 
 def _torchvision_resnet18() -> dict[str, tuple[int, ...]]:
@@ -57,6 +59,9 @@ def test_group_norm_has_the_same_names_without_running_statistics():
     assert found == {name for name in _torchvision_resnet18() if not name.endswith(gone)}
 
 
+LEARNED = sorted(set(POLICIES) - {"replay"})
+
+
 class _Recorded(dict[str, torch.Tensor]):
     """Named tensors that remember which of them were asked for."""
 
@@ -77,7 +82,7 @@ def _observation(n, **sizes):
     return _Recorded({**images, "gripper": torch.rand(n, 2)})
 
 
-@pytest.mark.parametrize("policy", sorted(POLICIES))
+@pytest.mark.parametrize("policy", LEARNED)
 def test_a_policy_takes_images_and_gripper_and_nothing_else(policy):
     sizes = {"wrist": (32, 32), "overview": (32, 48)}
     config = TrainConfig.for_policy(policy, cameras=tuple(sizes), hidden=8)
@@ -91,9 +96,7 @@ def test_a_policy_takes_images_and_gripper_and_nothing_else(policy):
     assert observation.asked == {"images/wrist", "images/overview", "gripper", "action"}
 
 
-@pytest.mark.parametrize(
-    ("policy", "norm"), [(p, n) for p in sorted(POLICIES) for n in get_policy(p).norms]
-)
+@pytest.mark.parametrize(("policy", "norm"), [(p, n) for p in LEARNED for n in get_policy(p).norms])
 @pytest.mark.parametrize("sizes", [{"wrist": (33, 33)}, {"wrist": (33, 20), "top": (18, 33)}])
 def test_every_policy_maps_uint8_windows_to_actions(policy, norm, sizes):
     config = TrainConfig.for_policy(policy, norm=norm, hidden=8, cameras=tuple(sizes))
@@ -112,7 +115,7 @@ def test_cameras_share_the_encoders_class_and_not_its_weights():
     assert not torch.equal(wrist.layers[0].weight, overview.layers[0].weight)
 
 
-@pytest.mark.parametrize("policy", sorted(POLICIES))
+@pytest.mark.parametrize("policy", LEARNED)
 def test_normalisation_is_part_of_the_state_dict(policy):
     model = build_policy(TrainConfig.for_policy(policy), {"wrist": (32, 32)})
     names = set(model.state_dict())
@@ -228,3 +231,28 @@ def test_what_is_no_policy_is_refused(monkeypatch):
     monkeypatch.setitem(POLICIES, "resnet", "sart_toolkit.learn.policies.resnet18_mlp:ResNet18")
     with pytest.raises(UnknownName, match="policy 'resnet': expected a subclass of Policy, got"):
         get_policy("resnet")
+
+
+# --- replay -------------------------------------------------------------------------------------
+
+
+def test_replay_gives_the_demonstrations_actions_whatever_is_seen_and_then_holds_still(
+    dataset, tmp_path
+):
+    config = TrainConfig.for_policy("replay", image_size=32, device="cpu")
+    result = train(dataset, config, tmp_path / "skill")
+    save_skill(tmp_path / "skill", result, dataset)
+    assert result.final_loss == 0.0
+    demonstration = dataset.sources[0].demonstration
+    skill = load_skill(tmp_path / "skill")
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        skill.reset()
+        for t in range(len(demonstration) + 3):
+            image = rng.integers(0, 256, (32, 32, 3), dtype=np.uint8)
+            action = skill.act({"wrist": image}, rng.uniform())
+            if t < len(demonstration):
+                np.testing.assert_allclose(action, demonstration.actions[t], atol=1e-6)
+            else:
+                np.testing.assert_allclose(action[:6], 0.0)
+                assert action[6] == demonstration.actions[-1, 6]

@@ -329,6 +329,23 @@ def test_an_episode_of_another_demonstration_is_refused(dataset, with_last, open
         open_windows(with_last(dataset, demonstration_hash="0"))
 
 
+def test_of_an_episode_that_is_not_merged_only_its_segment_is_learned(
+    dataset, with_last, open_windows
+):
+    whole, cut = open_windows(dataset), open_windows(with_last(dataset, merged=False))
+    episode = dataset.episode(2)
+    n, t_star = len(dataset.sources[0].demonstration), episode.provenance.t_star
+    assert whole.multiplicity.sum() - cut.multiplicity.sum() == n - t_star
+    # Its last step still leads to where it would join.
+    last = n + 3 * len(episode) - 1
+    for windows in (whole, cut):
+        (at,) = torch.nonzero(windows.history[:, -1] == last)[:, 0]
+        expected = episode.actions(dataset.sources[0].demonstration)[len(episode) - 1]
+        np.testing.assert_allclose(windows.actions[at], expected, atol=1e-6)
+    joins = (cut.history[:, -1] == t_star) & (cut.history[:, -2] == last)
+    assert not joins.any()
+
+
 @pytest.mark.parametrize("t_star", [-1, 9])
 def test_an_episode_that_rejoins_nowhere_is_refused(dataset, t_star, with_last, open_windows):
     with pytest.raises(Mismatch, match=f"episode 2 rejoins at step {t_star} of a demonstration"):

@@ -8,6 +8,7 @@ import torch
 
 from sart_toolkit.data import storage
 from sart_toolkit.data.schemas import TrainingFile
+from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, OutputExists
 from sart_toolkit.learn.policy import Policy, PolicySetup
 from sart_toolkit.learn.samples import FRAMES
@@ -47,6 +48,19 @@ def test_a_skill_is_the_files_of_the_design(trained):
     assert training["versions"]["torch"] == torch.__version__
     assert training["config"] == result.config.to_json()
     assert (training["windows"], training["trajectories"]) == (35, 4)
+
+
+def test_a_skill_of_demonstrations_alone_has_no_annotation(dataset, small_config, tmp_path):
+    sources = [(dataset.sources[0].demonstration, None)]
+    alone = write_dataset(tmp_path / "data", sources, [], {})
+    # One with an annotation stood here before.
+    save_skill(tmp_path / "skill", train(dataset, small_config, tmp_path / "skill"), dataset)
+    result = train(alone, small_config, tmp_path / "skill", resume=False)
+    save_skill(tmp_path / "skill", result, alone, overwrite=True)
+    assert not (tmp_path / "skill" / "annotation.json").exists()
+    skill = load_skill(tmp_path / "skill")
+    assert skill.annotation is None
+    assert skill.demonstration.content_hash() == alone.sources[0].demonstration_hash
 
 
 def _images(steps, t):

@@ -1,4 +1,4 @@
-"""Policies by name; each is a `Policy`, and these two share a head (`mlp.py`).
+"""Policies by name; each is a `Policy`, and those that learn share a head (`mlp.py`).
 
 A new policy is one file with a `Policy` and one line in `POLICIES`.
 """
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 POLICIES = {
     "compact_mlp": "sart_toolkit.learn.policies.compact_mlp:CompactMLP",
     "resnet18_mlp": "sart_toolkit.learn.policies.resnet18_mlp:ResNet18MLP",
+    "replay": "sart_toolkit.learn.policies.replay:Replay",
 }
 
 
