@@ -131,7 +131,7 @@ class SegmentRun:
         Recorded are the rest and each step but the last: that one ends at the waypoint, where the
         demonstration's own step stands.
         """
-        self._rest(motion)
+        self.rest(motion)
         rows = len(self._times(motion)) - 1 if record else 0
         if record:
             self._step_end = self._record()
@@ -194,8 +194,8 @@ class SegmentRun:
         """Targets `(steps, n)` of a control period at rest at the end of a motion."""
         return motion.path.positions(np.ones(self._rates.physics_per_control))
 
-    def _rest(self, motion: Motion) -> None:
-        """Stay at the end of a motion until the joints rest, for whole recorded steps."""
+    def rest(self, motion: Motion) -> None:
+        """Stay at the sampled pose until the joints rest, for whole recorded steps."""
         per_record = self._rates.control_per_record
         for _ in range(round(_LONGEST_REST * self._rates.record_hz)):
             self._pressed = self._no_force

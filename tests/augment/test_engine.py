@@ -19,7 +19,7 @@ from sart_toolkit.augment import STRATEGIES, engine, get_strategy
 from sart_toolkit.augment.allocation import allocate
 from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration, augment_sources
-from sart_toolkit.augment.executors import Attempt, RestoreExecutor
+from sart_toolkit.augment.executors import Attempt, RestoreExecutor, no_spare
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends.interface import Contact, KnowsBodies, Resets, SavesStates
@@ -887,7 +887,7 @@ class Backwards(RestoreExecutor):
 
     parallel = False
 
-    def attempts(self, keys):
+    def attempts(self, keys, spare=no_spare):
         return map(self.attempt, reversed(list(keys)))
 
 
