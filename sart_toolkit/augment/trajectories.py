@@ -17,7 +17,7 @@ from sart_toolkit.augment.execution import SegmentRun
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.backends.interface import BackendFactory, SavesStates, require
 from sart_toolkit.collision.phases import BODY_STILLNESS
-from sart_toolkit.data.dataset import load_dataset
+from sart_toolkit.data.dataset import REPLAY, load_dataset
 from sart_toolkit.data.records import Episode, apply_action, library_versions
 from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
@@ -25,8 +25,6 @@ from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.poses import distance
 from sart_toolkit.tasks.task import Task
 from sart_toolkit.workers import worker_map
-
-REPLAY = "replay.json"
 
 
 def replay_dataset(

@@ -12,7 +12,9 @@ from sart_toolkit.cli.arguments import Augment, Validate
 from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
+from sart_toolkit.data.dataset import REPLAY
 from sart_toolkit.data.sampling import SamplingConfig
+from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, Mismatch
 
 
@@ -67,6 +69,8 @@ def validate_verb(args: Validate) -> dict[str, Any]:
         ):
             if given:
                 raise InvalidInput(f"--{flag}: is about executing the trajectories; add --replay")
+    else:
+        check_writable(args.dataset / REPLAY, args.overwrite)
     replayed = {}
     with ProgressDisplay() as progress:
         found = pipeline.validate(args.dataset, task=args.task, robot=args.robot, progress=progress)

@@ -168,9 +168,11 @@ def with_loose_block(scene):
 def attempts(peg_demonstration, peg_annotation, peg_backend):
     """Makes attempts from two spheres, their spares being the next numbers."""
 
-    def attempts(backend=peg_backend, config=REPLAY, demonstration=peg_demonstration):
+    def attempts(
+        backend=peg_backend, config=REPLAY, demonstration=peg_demonstration, spheres=(0, 1)
+    ):
         executor = ReplayExecutor(backend, [(demonstration, peg_annotation)], config)
-        last = {0: 1, 1: 1}
+        last = dict.fromkeys(spheres, 1)
 
         def spare(source, sphere):
             last[sphere] += 1
@@ -178,7 +180,8 @@ def attempts(peg_demonstration, peg_annotation, peg_backend):
                 return None
             return AttemptKey(source, sphere, last[sphere])
 
-        return list(executor.attempts([AttemptKey(0, s, k) for s in (0, 1) for k in (0, 1)], spare))
+        keys = [AttemptKey(0, sphere, k) for sphere in spheres for k in (0, 1)]
+        return list(executor.attempts(keys, spare))
 
     return attempts
 
@@ -308,25 +311,25 @@ def test_a_waypoint_that_does_not_reproduce_is_given_up_after_three_arrivals(
 ):
     """From a waypoint on the demonstration has the block where it isn't."""
     Ts = np.array(peg_demonstration.body_Ts_world["block"])
-    Ts[26:, 0, 3] += 0.002
+    Ts[27:, 0, 3] += 0.002
     bodies = {**peg_demonstration.body_Ts_world, "block": Ts}
     monkeypatch.setattr(peg_backend, "scene", with_loose_block(peg_backend.scene))
     demonstration = dataclasses.replace(peg_demonstration, body_Ts_world=bodies)
     with caplog.at_level(logging.WARNING):
-        made = attempts(demonstration=demonstration)
+        made = attempts(demonstration=demonstration, spheres=(0, 2))
     assert [a.outcome for a in made[:2]] == ["kept", "kept"]
     given_up = made[2:]
     # The two that were wanted, and all their spares, for which the robot doesn't move.
     assert {a.key.k for a in given_up} == set(range(5))
-    assert all(a.key.sphere == 1 for a in given_up)
+    assert all(a.key.sphere == 2 for a in given_up)
     assert {a.outcome for a in given_up} == {"demonstration doesn't reproduce"}
     assert (
-        "3 times something was otherwise at waypoint 27, the last time block was moved: by 2.00"
+        "3 times something was otherwise at waypoint 29, the last time block was moved: by 2.00"
         in given_up[-1].detail
     )
     assert sum(a.resets for a in made) == 3
     assert sum(a.seconds > 0 for a in given_up) == 1
-    assert "at waypoint 27 the scene isn't the demonstration's: block was moved" in caplog.text
+    assert "at waypoint 29 the scene isn't the demonstration's: block was moved" in caplog.text
 
 
 def test_an_interrupted_generation_keeps_what_is_written_and_resumes(made):
