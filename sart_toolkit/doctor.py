@@ -217,9 +217,15 @@ def probe_kinematics() -> str:
 
 
 def probe_pybullet() -> str:
-    """What PyBullet is, after it let a ball fall and drew it with TinyRenderer."""
+    """What PyBullet and embreex are, after a ball fell in the one and was drawn by the other."""
     import numpy as np
     import pybullet
+
+    from sart_toolkit.backends.raycast import RayCaster
+    from sart_toolkit.poses import pose
+    from sart_toolkit.robots.spec import CameraSpec, Shape, look_at
+    from sart_toolkit.robots.visuals import shape_mesh
+    from sart_toolkit.scenes.spec import Light
 
     client = pybullet.connect(pybullet.DIRECT)
     shape = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.1)
@@ -228,17 +234,14 @@ def probe_pybullet() -> str:
     for _ in range(60):
         pybullet.stepSimulation()
     height = pybullet.getBasePositionAndOrientation(ball)[0][2]
-    _check_fall(height)
-    image = pybullet.getCameraImage(
-        32,
-        32,
-        pybullet.computeViewMatrix([1, 0, height], [0, 0, height], [0, 0, 1]),
-        pybullet.computeProjectionMatrixFOV(60, 1, 0.01, 5),
-        renderer=pybullet.ER_TINY_RENDERER,
-    )
-    _check_image(bool((np.asarray(image[4]) == ball).any()))
     pybullet.disconnect(client)
-    return f"{_version('pybullet')}, simulates and draws"
+    _check_fall(height)
+    caster = RayCaster({"ball": [shape_mesh(Shape("sphere", (0.1,)))]}, Light())
+    at = np.array([0, 0, height])
+    camera = CameraSpec("camera", "world", look_at(at + [1, 0, 0], at, np.array([0, 0, 1.0])))
+    image = caster.view(camera, np.eye(4), (32, 32), {"ball": pose(at)})
+    _check_image(bool((image.depth > 0).any()))
+    return f"{_version('pybullet')}, {_version('embreex')}, simulates and draws"
 
 
 def probe_sapien_physics() -> str:

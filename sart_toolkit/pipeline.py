@@ -28,6 +28,7 @@ from sart_toolkit.data.records import (
     Annotation,
     Demonstration,
     Rates,
+    Recording,
     Referring,
     library_versions,
 )
@@ -58,9 +59,11 @@ from sart_toolkit.registry import check_known, reference_to
 from sart_toolkit.robots import ROBOTS, get_robot
 from sart_toolkit.robots.spec import check_image_size
 from sart_toolkit.tasks import TASKS, get_task
+from sart_toolkit.workers import Workers
 
 if TYPE_CHECKING:
     from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.augment.preview import Preview
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
     from sart_toolkit.backends.interface import Backend, BackendFactory
@@ -72,6 +75,7 @@ if TYPE_CHECKING:
     from sart_toolkit.learn.training import TrainConfig
     from sart_toolkit.record.session import Device, DeviceSetup, SessionConfig
     from sart_toolkit.robots.spec import ImageSize, RobotSpec
+    from sart_toolkit.scenes.spec import SceneSpec
     from sart_toolkit.tasks.task import Placement, Task
 
     RobotLike = str | RobotSpec
@@ -184,14 +188,22 @@ def backend_maker(
         UnknownName: the robot, the task or the backend can't be found.
         InvalidInput: the appearance that the recording notes is none.
     """
-    spec, scene = robot_of(source, robot), task_of(source, task).scene
+    spec, scene = _setting(source, task, robot)
     made = _find(source, "backend", backend, get_backend)
+    return functools.partial(make_backend, made, spec, scene, image_size, rates)
+
+
+def _setting(
+    source: Referring, task: TaskLike | None, robot: RobotLike | None
+) -> tuple[RobotSpec, SceneSpec]:
+    """The robot and the scene of a recording or skill, as they looked when it was made."""
+    spec, scene = robot_of(source, robot), task_of(source, task).scene
     if isinstance(source, Demonstration) and "appearance" in source.task_parameters:
         from sart_toolkit.scenes.appearance import Appearance
 
         appearance = Appearance.from_json(source.task_parameters["appearance"])
         spec, scene = appearance.applied(spec, scene)
-    return functools.partial(make_backend, made, spec, scene, image_size, rates)
+    return spec, scene
 
 
 def image_size_of(demonstration: Demonstration) -> tuple[int, int]:
@@ -498,7 +510,7 @@ def augment(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     backend: BackendLike | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Progress = _silent,
     sensor: SensorErrors | None = None,
@@ -513,7 +525,7 @@ def augment(
             needs none.
         out: directory to write; an interrupted generation resumes.
         task, robot, backend: in place of those that the demonstrations note.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: whether `out` may be replaced.
         progress: called with the trajectories kept.
         sensor: with `obstacles` "cloud", what the images may be off by; if left out, what the
@@ -528,6 +540,84 @@ def augment(
         Mismatch: an annotation belongs to none of the demonstrations, or these look different.
         InvalidInput, MissingCapability, OutputExists, CannotWrite: as `augment_sources`.
     """
+    sources, config = _asked_for(demo, annotation, task, robot, backend, sensor, options)
+    from sart_toolkit.augment.engine import augment_sources
+
+    first = sources[0][0]
+    size, rates = image_size_of(first), first.rates
+    make = backend_maker(first, size, rates, task, robot, backend)
+    return augment_sources(
+        sources, make, out, config, workers, overwrite,
+        lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
+        ask,
+    )  # fmt: skip
+
+
+@_alone
+def preview(
+    demo: Path | Sequence[Path],
+    annotation: Path | Sequence[Path],
+    out: Path,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+    workers: int | Workers = 1,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    sensor: SensorErrors | None = None,
+    **options: Any,
+) -> Preview:
+    """What `augment` with the same arguments would attempt, planned and proved, in a file `out`.
+
+    Nothing is executed and no backend is made, so that it may be looked at before a robot moves.
+
+    Args:
+        demo, annotation: as for `augment`.
+        out: JSON lines: the settings, then each attempt with its pose and certificate.
+        task, robot, backend: in place of those that the demonstrations note.
+        workers: how many processes, or `Workers` elsewhere.
+        overwrite: whether `out` may be replaced.
+        progress: called with the segments proved.
+        sensor: as for `augment`.
+        options: of `AugmentConfig`.
+
+    Raises:
+        MissingFile, BrokenFile: a file can't be read.
+        UnknownName: task, robot or backend can't be found.
+        Mismatch: an annotation belongs to none of the demonstrations, or these look different.
+        InvalidInput, OutputExists, CannotWrite: as `preview_sources`.
+    """
+    check_writable(out, overwrite)
+    sources, config = _asked_for(demo, annotation, task, robot, backend, sensor, options)
+    from sart_toolkit.augment.preview import preview_sources
+
+    first = sources[0][0]
+    return preview_sources(
+        sources, *_setting(first, task, robot),
+        _find(first, "backend", backend, get_backend).tracking_error, out, config, workers,
+        overwrite,
+        lambda proved, wanted, rejected: progress("plan", proved, wanted, f"{rejected} rejected"),
+    )  # fmt: skip
+
+
+def _asked_for(
+    demo: Path | Sequence[Path],
+    annotation: Path | Sequence[Path],
+    task: TaskLike | None,
+    robot: RobotLike | None,
+    backend: BackendLike | None,
+    sensor: SensorErrors | None,
+    options: dict[str, Any],
+) -> tuple[list[tuple[Demonstration, Annotation | None]], AugmentConfig]:
+    """What `augment` generates from, and how.
+
+    Raises:
+        MissingFile, BrokenFile: a file can't be read.
+        UnknownName: task, robot or backend can't be found.
+        Mismatch: an annotation belongs to none of the demonstrations, or these look different.
+        InvalidInput: an option is not acceptable.
+    """
     strategy = options.get("strategy", "sart")
     check_names(task=task, robot=robot, backend=backend, strategy=strategy)
     demos = [demo] if isinstance(demo, Path) else list(demo)
@@ -535,10 +625,9 @@ def augment(
     for path, (demonstration, _) in zip(demos, sources, strict=True):
         _check(demonstration, robot_of(demonstration, robot), str(path))
     sources = [(noted(d, task, robot, backend), spheres) for d, spheres in sources]
-    first, annotated = sources[0][0], [a for _, a in sources if a is not None]
+    annotated = [a for _, a in sources if a is not None]
     from sart_toolkit.augment import get_strategy
     from sart_toolkit.augment.config import AugmentConfig
-    from sart_toolkit.augment.engine import augment_sources
 
     draws = get_strategy(strategy).draws
     if not draws:
@@ -555,13 +644,7 @@ def augment(
     for demonstration, spheres in sources:
         if spheres is not None:
             _warn_of_unproved(demonstration, spheres, config, task, robot)
-    size, rates = image_size_of(first), first.rates
-    make = backend_maker(first, size, rates, task, robot, backend)
-    return augment_sources(
-        sources, make, out, config, workers, overwrite,
-        lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
-        ask,
-    )  # fmt: skip
+    return sources, config
 
 
 def _sources(
@@ -661,7 +744,7 @@ def replay(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     backend: BackendLike | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Progress = _silent,
 ) -> dict[str, Any]:
@@ -670,7 +753,7 @@ def replay(
     Args:
         dataset: directory from `augment`.
         task, robot, backend: in place of those that its demonstrations note.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: whether an earlier result may be replaced.
         progress: called with the trajectories done.
 
@@ -688,6 +771,72 @@ def replay(
         dataset, task_of(demonstration, task), make, workers, overwrite,
         lambda done, wanted, failed: progress("replay", done, wanted, f"{failed} failed"),
     )  # fmt: skip
+
+
+def merge(
+    datasets: Sequence[Path], out: Path, *, overwrite: bool = False, progress: Progress = _silent
+) -> Dataset:
+    """One dataset, in directory `out`, of several of one task and robot.
+
+    Args:
+        datasets: directories from `augment`, `merge` or `split`.
+        out: directory to write; an interrupted merge resumes.
+        overwrite: whether a dataset in `out` may be replaced.
+        progress: called with the episodes done.
+
+    Raises:
+        MissingFile, BrokenFile: a dataset can't be read.
+        InvalidInput, Mismatch, OutputExists, CannotWrite: as `merge_datasets`.
+    """
+    from sart_toolkit.data.combine import merge_datasets
+
+    found = [load_dataset(path) for path in datasets]
+    return merge_datasets(found, out, overwrite, lambda *counts: progress("merge", *counts))
+
+
+def split(
+    dataset: Path,
+    out: Path,
+    *,
+    parts: Mapping[str, float] | None = None,
+    n: int | None = None,
+    by_source: bool = False,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Dataset]:
+    """Parts of a dataset as datasets of their own, by their names.
+
+    Args:
+        dataset: directory from `augment`, `merge` or `split`.
+        out: directory to write; an interrupted split resumes.
+        parts: the fraction of the episodes that each part gets, by its name; written to `out/NAME`.
+        n: one part of so many trajectories, written to `out` itself.
+        by_source: a part for each demonstration, written to `out/demoNN`.
+        seed: of which episodes `parts` get.
+        overwrite: whether datasets that are there may be replaced.
+        progress: called with the episodes done.
+
+    Raises:
+        MissingFile, BrokenFile: the dataset can't be read.
+        InvalidInput: not exactly one of `parts`, `n` and `by_source` is given; or as
+            `split_dataset` and `shorten_dataset`.
+        OutputExists, CannotWrite: as these.
+    """
+    from sart_toolkit.data.combine import shorten_dataset, split_dataset, split_sources
+
+    if (parts is not None) + (n is not None) + by_source != 1:
+        raise InvalidInput("split: expected one of parts, n and by_source; give just one")
+    found = load_dataset(dataset)
+
+    def shown(done: int, total: int) -> None:
+        progress("split", done, total)
+
+    if parts is not None:
+        return split_dataset(found, out, parts, seed, overwrite, shown)
+    if n is not None:
+        return {"": shorten_dataset(found, out, n, overwrite, shown)}
+    return split_sources(found, out, overwrite, shown)
 
 
 @_alone
@@ -716,20 +865,11 @@ def train_policy(
             from (`check_recording`).
         OutputExists, CannotWrite: `out` can't be written.
     """
-    generated = load_dataset(dataset)
-    if policy is None:
-        policy = _policy_for(generated)
-    check_names(policy=policy)
     check_writable(out / "config.json", overwrite)
-    from sart_toolkit.record.checks import check_recording
-
-    for source in generated.sources:
-        # Its robot's limits were compared when the dataset was made; here it need not be found.
-        check_recording(source.demonstration, name=str(source.path))
+    generated, config = _training(dataset, policy, options)
     from sart_toolkit.learn.skill import save_skill
     from sart_toolkit.learn.training import train
 
-    config = _train_config(policy, options)
     if overwrite and (out / "config.json").exists():
         clear_directory(out, "config.json", overwrite=True)
     result = train(
@@ -738,6 +878,61 @@ def train_policy(
     )  # fmt: skip
     save_skill(out, result, generated)
     return config
+
+
+@_alone
+def train_seeds(
+    dataset: Path,
+    out: Path,
+    seeds: Sequence[int],
+    policy: str | type[Policy] | None = None,
+    *,
+    workers: int | Workers = 1,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+    **options: Any,
+) -> dict[str, Any]:
+    """A table of the skills trained on a dataset's directory with each seed, in directory `out`.
+
+    Args:
+        dataset: directory from `augment`.
+        out: directory to write: `seed0` and so on, and `sweep.json`; interrupted, it resumes.
+        seeds: what differs.
+        policy: what is trained; what the dataset's strategy is for if left out.
+        workers: how many processes, or `Workers` elsewhere.
+        overwrite: whether a sweep in `out` may be replaced.
+        progress: called with the trainings done.
+        options: of `TrainConfig`, but `seed`; the policy's own where left out or None.
+
+    Raises:
+        MissingFile, BrokenFile, UnknownName, InvalidInput: as `train_policy`.
+        OutputExists, Mismatch, CannotWrite: as `learn.sweep.train_seeds`.
+    """
+    check_writable(out / "sweep.json", overwrite)
+    generated, config = _training(dataset, policy, options)
+    from sart_toolkit.learn import sweep
+
+    return sweep.train_seeds(
+        generated, config, seeds, out, workers, overwrite,
+        lambda done, total: progress("sweep", done, total),
+        lambda done, total, text: progress("train", done, total, text),
+    )  # fmt: skip
+
+
+def _training(
+    dataset: Path, policy: str | type[Policy] | None, options: Mapping[str, Any]
+) -> tuple[Dataset, TrainConfig]:
+    """A dataset that can be learned from, and how."""
+    generated = load_dataset(dataset)
+    if policy is None:
+        policy = _policy_for(generated)
+    check_names(policy=policy)
+    from sart_toolkit.record.checks import check_recording
+
+    for source in generated.sources:
+        # Its robot's limits were compared when the dataset was made; here it need not be found.
+        check_recording(source.demonstration, name=str(source.path))
+    return generated, _train_config(policy, options)
 
 
 def _policy_for(dataset: Dataset) -> str:
@@ -765,7 +960,7 @@ def evaluate(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     backend: BackendLike | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     device: str = "cpu",
     overwrite: bool = False,
     progress: Progress = _silent,
@@ -777,7 +972,7 @@ def evaluate(
         skill: the skill.
         out: JSON file to write; videos go beside it. An interrupted evaluation resumes.
         task, robot, backend: in place of those that the skill notes.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         device: where the policy runs.
         overwrite: whether `out` may be replaced.
         progress: called with the rollouts done.
@@ -854,11 +1049,12 @@ def run(
     episodes: int = 50,
     epochs: int | None = None,
     distribution: Literal["paper", "area"] = "paper",
+    recording: Recording = "reversed",
     cameras: Sequence[str] = ("wrist",),
     image_size: ImageSize = 128,
     seed: int = 0,
     eval_seed: int = 1000,
-    workers: int = 1,
+    workers: int | Workers = 1,
     device: str = "auto",
     overwrite: bool = False,
     command: str = "sart_toolkit.run",
@@ -883,11 +1079,12 @@ def run(
         episodes: rollouts with random placements.
         epochs: of training, the policy's own if None.
         distribution: how positions are drawn on a sphere.
+        recording: whether segments are recorded on the way out and reversed, or on the return.
         cameras: whose images are recorded and trained on.
         image_size: width and height of recorded images [pixels]; one number for a square.
         seed: of all that is random, except evaluation.
         eval_seed: of the placements that are evaluated.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         device: where training and the policy run: "auto", "cpu" or "cuda".
         overwrite: whether a run in `out` may be replaced.
         command: how it was asked for, kept with the run.
@@ -920,6 +1117,7 @@ def run(
     get_backend(backend)
     generation: dict[str, Any] = {
         "n": n, "strategy": strategy, "sampling": SamplingConfig(distribution), "seed": seed,
+        "recording": recording,
     }  # fmt: skip
     drawn = AugmentConfig(**generation)
     training: dict[str, Any] = {
@@ -942,6 +1140,7 @@ def run(
         "cameras": list(cameras),
         "image_size": list(size),
         "distribution": distribution,
+        "recording": recording,
         "epochs": epochs,
         "device": device,
     }

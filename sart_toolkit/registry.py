@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import Any
 
 from sart_toolkit.errors import InvalidInput, SartError, UnknownName, nearest_name, unknown_name
-from sart_toolkit.userfiles import file_of, load_file
+from sart_toolkit.userfiles import file_of, load_file, local_file
 
 _HOW = "or name your own as package.module:NAME or path/to/file.py:NAME"
 
@@ -80,7 +80,7 @@ def check_known(kind: str, reference: Any, table: Mapping[str, str]) -> None:
             f"{kind} {reference!r}: expected package.module:NAME or path/to/file.py:NAME"
         )
     if place.endswith(".py"):
-        if not Path(place).is_file():
+        if not local_file(place).is_file():
             raise UnknownName(
                 f"{kind} {reference!r}: no file {place} from {Path.cwd()}; "
                 "pass a path that exists, or change to its folder"

@@ -9,7 +9,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import importlib
 import importlib.metadata
+import io
 import itertools
 import json
 import os
@@ -19,24 +21,30 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from sart_toolkit import doctor
 from sart_toolkit.annotate.session import AnnotationSession
 from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.backends.interface import Backend, BackendFactory, Resets, require
+from sart_toolkit.augment.preview import preview_sources
+from sart_toolkit.backends import BACKENDS, get_backend, make_backend
+from sart_toolkit.backends.interface import Backend, BackendFactory, Draws, Resets, require
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.cloud import fuse_cloud
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
+from sart_toolkit.data import storage
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     Annotation,
@@ -70,7 +78,9 @@ from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.scenes.spec import SceneSpec
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.robots.visuals import shape_mesh
+from sart_toolkit.scenes.spec import SceneSpec, SceneState
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
 from sart_toolkit.testing.closest import ClosestPoints
@@ -538,18 +548,239 @@ def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
 
 
 def augmentation(
-    task_name: str, image_size: int
+    task_name: str, image_size: int, backend: str = "pybullet"
 ) -> tuple[Demonstration, Annotation, BackendFactory]:
     """A demonstration of a task, its suggested spheres, and what makes its robot and scene."""
     task = get_task(task_name)
     robot = get_robot(task.robot)
-    make = functools.partial(make_backend, "pybullet", robot, task.scene, image_size)
+    make = functools.partial(make_backend, backend, robot, task.scene, image_size)
     model = RobotModel(robot, task.scene.held)
     plan = task.plan(task.initial_state(model, Placement()))
     operator = ScriptedOperator(plan, np.random.default_rng(0))
-    demonstration = record_demonstration(make(), task, model, operator)
+    with closing(make()) as robot_in_scene:
+        demonstration = record_demonstration(robot_in_scene, task, model, operator)
     world = ExactWorld(demonstration, robot, task.scene)
     return demonstration, suggest_annotation(demonstration, world), make
+
+
+# --- planning -----------------------------------------------------------------------------------
+
+
+def bench_plan(arguments: Sequence[str]) -> dict[str, Any]:
+    """Segments drawn, planned and proved a second, nothing executed, as `sart augment --dry-run`.
+
+    From the first segment that is done to the last, by task; what each process computes once, the
+    robot's model and that of each waypoint, comes before. `whole_call` counts all, with the start
+    of the processes.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py plan", description=bench_plan.__doc__)
+    parser.add_argument("--tasks", default="all", help=f"all, {', '.join(TASKS)}")
+    parser.add_argument("--n", type=int, default=1000, help="trajectories, of each task")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args(arguments)
+    check_positive("--repeats", options.repeats)
+    tasks = list(TASKS) if options.tasks == "all" else options.tasks.split(",")
+    rates = {task: [_plan_rates(task, options) for _ in range(options.repeats)] for task in tasks}
+    return {
+        "proved_per_second": {
+            task: statistics.median(row["proved_per_second"] for row in rows)
+            for task, rows in rates.items()
+        },
+        "proved_per_second_range": {
+            task: [pick(row["proved_per_second"] for row in rows) for pick in (min, max)]
+            for task, rows in rates.items()
+        },
+        "whole_call": {
+            task: statistics.median(row["whole_call"] for row in rows)
+            for task, rows in rates.items()
+        },
+        "rejections": {task: rows[0]["rejections"] for task, rows in rates.items()},
+        "n": options.n,
+        "processes": options.workers,
+        "repeats": options.repeats,
+    }
+
+
+def _plan_rates(task_name: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Segments a second of one preview."""
+    demonstration, annotation, _ = augmentation(task_name, 64)
+    task = get_task(task_name)
+    proved: list[tuple[float, int]] = []
+
+    def progress(done: int, wanted: int, rejected: int) -> None:
+        proved.append((time.perf_counter(), done))
+
+    with tempfile.TemporaryDirectory() as scratch:
+        started = time.perf_counter()
+        found = preview_sources(
+            [(demonstration, annotation)], get_robot(task.robot), task.scene,
+            get_backend("pybullet").tracking_error, Path(scratch) / "plan.jsonl",
+            AugmentConfig(options.n), options.workers, progress=progress,
+        )  # fmt: skip
+        seconds = time.perf_counter() - started
+    # Each process begins with the models of some waypoints.
+    first = len(proved) // 10
+    (begin, before), (end, after) = proved[first], proved[-1]
+    rate = (after - before) / (end - begin)
+    _say(f"{task_name}: {rate:.0f} proved/s")
+    return {
+        "proved_per_second": rate,
+        "whole_call": found.proved / seconds,
+        "rejections": dict(found.rejections),
+    }
+
+
+# --- storage ------------------------------------------------------------------------------------
+
+
+def bench_storage(arguments: Sequence[str]) -> dict[str, Any]:
+    """How small images get and how long they take to write and read, by how they are stored.
+
+    Images of generated episodes, by task and backend, in HDF5 files in memory, an image a chunk, by
+    HDF5's own filters; `ours` is what the toolkit does. With the package `hdf5plugin` its filters
+    too, which whoever opens such a file needs as well. PNG files stand beside; a depth image is
+    float32 of metres, in `png_16_bit` tenths of a millimetre. `episode`: a whole one written, its
+    hashes and flush to the disk counted, and read.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py storage", description=bench_storage.__doc__)
+    parser.add_argument("--tasks", default="peg_in_hole,toolbox_picking", help=", ".join(TASKS))
+    parser.add_argument("--backends", default="pybullet,sapien", help=", ".join(BACKENDS))
+    parser.add_argument("--image-size", type=int, default=128, help="[pixels]")
+    parser.add_argument("--episodes", type=int, default=4, help="of each task and backend")
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args(arguments)
+    for name in ("episodes", "repeats"):
+        check_positive(f"--{name}", getattr(options, name))
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        for task, backend in itertools.product(
+            options.tasks.split(","), options.backends.split(",")
+        ):
+            name = f"{task} on {backend}"
+            demonstration, annotation, make = augmentation(task, options.image_size, backend)
+            config = AugmentConfig(options.episodes + 1)
+            dataset = augment_demonstration(
+                demonstration, annotation, make, Path(scratch) / name, config
+            )
+            episodes = list(dataset)
+            figures[name] = {
+                part: _codec_figures(
+                    np.concatenate([getattr(e.steps.cameras["wrist"], part) for e in episodes]),
+                    options.repeats,
+                )
+                for part in ("rgb", "depth")
+            } | {"episode": _episode_figures(episodes, Path(scratch), options.repeats)}
+            _say(f"{name}: {figures[name]['episode']['write_ms']:.1f} ms to write an episode")
+    return {"image_size": options.image_size, "repeats": options.repeats, **figures}
+
+
+def _codecs() -> dict[str, dict[str, Any]]:
+    """What HDF5 is asked for, by a name."""
+    found: dict[str, dict[str, Any]] = {
+        "raw": {},
+        "lzf": {"compression": "lzf"},
+        "shuffle_lzf": {"compression": "lzf", "shuffle": True},
+    }
+    for level in (1, 4):
+        found[f"gzip_{level}"] = {"compression": "gzip", "compression_opts": level}
+        found[f"shuffle_gzip_{level}"] = found[f"gzip_{level}"] | {"shuffle": True}
+    try:
+        plugin = importlib.import_module("hdf5plugin")
+    except ImportError:
+        _say("hdf5plugin isn't installed: without its filters")
+        return found
+    return found | {
+        "plugin_lz4": dict(plugin.LZ4()),
+        "plugin_zstd_1": dict(plugin.Zstd(1)),
+        "plugin_bitshuffle_lz4": dict(plugin.Bitshuffle(cname="lz4")),
+        "plugin_bitshuffle_zstd": dict(plugin.Bitshuffle(cname="zstd", clevel=1)),
+        "plugin_blosc_lz4": dict(plugin.Blosc(cname="lz4", clevel=5, shuffle=1)),
+        "plugin_blosc_zstd": dict(plugin.Blosc(cname="zstd", clevel=1, shuffle=1)),
+    }
+
+
+def _codec_figures(frames: NDArray[Any], repeats: int) -> dict[str, Any]:
+    """Of each way to store images: how much smaller they get, and microseconds an image."""
+    codecs: dict[str, Callable[[], tuple[int, float, float]]] = {
+        name: functools.partial(_through_hdf5, frames, functools.partial(_put_plain, filters))
+        for name, filters in _codecs().items()
+    }
+    codecs["ours"] = functools.partial(
+        _through_hdf5, frames, storage.put_frames, storage.get_frames
+    )
+    codecs["png"] = functools.partial(_through_png, frames, False)
+    if frames.dtype == np.float32:
+        codecs["png_16_bit"] = functools.partial(_through_png, frames, True)
+    # In turn, so that whatever else the machine does slows all alike.
+    turns = [{name: codec() for name, codec in codecs.items()} for _ in range(repeats)]
+    return {
+        name: {
+            "ratio": frames.nbytes / turns[0][name][0],
+            "write_us": 1e6 * statistics.median(turn[name][1] for turn in turns) / len(frames),
+            "read_us": 1e6 * statistics.median(turn[name][2] for turn in turns) / len(frames),
+        }
+        for name in codecs
+    }
+
+
+def _put_plain(filters: dict[str, Any], file: h5py.File, name: str, frames: NDArray[Any]) -> None:
+    file.create_dataset(name, data=frames, chunks=(1, *frames.shape[1:]), **filters)
+
+
+def _through_hdf5(
+    frames: NDArray[Any],
+    put: Callable[[h5py.File, str, NDArray[Any]], None],
+    get: Callable[[h5py.Dataset], NDArray[Any]] = lambda stored: stored[()],
+) -> tuple[int, float, float]:
+    """Bytes stored, and seconds to write and to read images."""
+    content = io.BytesIO()
+    started = time.perf_counter()
+    with h5py.File(content, "w") as file:
+        put(file, "images", frames)
+    written = time.perf_counter()
+    with h5py.File(content, "r") as file:
+        n_bytes = file["images"].id.get_storage_size()
+        opened = time.perf_counter()
+        found = get(file["images"])
+        read = time.perf_counter()
+    if not np.array_equal(found, frames):
+        raise SartError("storage: images aren't read back as they were written")
+    return n_bytes, written - started, read - opened
+
+
+def _through_png(frames: NDArray[Any], sixteen_bit: bool) -> tuple[int, float, float]:
+    """Bytes of PNG files, and seconds to write and to read them; float32 as four channels."""
+    if sixteen_bit:
+        frames = np.round(1e4 * frames).astype(np.uint16)
+    elif frames.dtype == np.float32:
+        frames = frames.view(np.uint8).reshape(*frames.shape, 4)
+    files = [io.BytesIO() for _ in frames]
+    started = time.perf_counter()
+    for file, frame in zip(files, frames, strict=True):
+        Image.fromarray(frame).save(file, "png", compress_level=1)
+    written = time.perf_counter()
+    for file in files:
+        np.asarray(Image.open(file))
+    read = time.perf_counter()
+    return sum(file.tell() for file in files), written - started, read - written
+
+
+def _episode_figures(episodes: Sequence[Episode], folder: Path, repeats: int) -> dict[str, float]:
+    """Milliseconds to write an episode's file and to read it, and its size."""
+    writing, reading, sizes = [], [], []
+    for turn, (i, episode) in itertools.product(range(repeats), enumerate(episodes)):
+        path = folder / f"{turn}_{i}.h5"
+        _, seconds = _timed(storage.save_episode, path, episode)
+        writing.append(1e3 * seconds)
+        reading.append(1e3 * _timed(storage.load_episode, path)[1])
+        sizes.append(path.stat().st_size)
+        path.unlink()
+    return {
+        "write_ms": statistics.median(writing),
+        "read_ms": statistics.median(reading),
+        "kilobytes": statistics.median(sizes) / 1000,
+    }
 
 
 # --- certificates -------------------------------------------------------------------------------
@@ -812,6 +1043,98 @@ def _drive(backend: Backend, task: Task, seed: int) -> tuple[float, float]:
         physics.append(time.perf_counter() - started)
 
 
+# --- images -------------------------------------------------------------------------------------
+
+
+def bench_draw(arguments: Sequence[str]) -> dict[str, Any]:
+    """Milliseconds of an RGB-D image by the wrist camera at the task's start, by task and renderer.
+
+    Rays, as the PyBullet backend draws; PyBullet's own TinyRenderer, called directly on the same
+    meshes; SAPIEN, where it can draw. Images of all alternate, one thread.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py draw", description=bench_draw.__doc__)
+    parser.add_argument("--tasks", default="all", help=f"all, or {','.join(TASKS)}")
+    parser.add_argument("--image-size", type=int, default=128, help="[pixels]")
+    parser.add_argument("--repeats", type=int, default=40, help="images of each, for the median")
+    options = parser.parse_args(arguments)
+    check_positive("--repeats", options.repeats)
+    size = options.image_size
+    figures: dict[str, Any] = {}
+    for name in list(TASKS) if options.tasks == "all" else options.tasks.split(","):
+        task = get_task(name)
+        robot = get_robot(task.robot)
+        state = task.initial_state(RobotModel(robot, task.scene.held), Placement())
+        opened = {kind: make_backend(kind, robot, task.scene, size) for kind in BACKENDS}
+        drawing = {kind: b for kind, b in opened.items() if not b.no_images}
+        renderers: dict[str, Callable[[], Any]] = {
+            {"pybullet": "rays"}.get(kind, kind): functools.partial(
+                require(backend, Draws, "it is measured").draw,
+                *(state, backend.cameras["wrist"], size, size),
+            )
+            for kind, backend in drawing.items()
+        }
+        renderers["tiny_renderer"] = _tiny_renderer(robot, task.scene, state, size)
+        seconds: dict[str, list[float]] = {kind: [] for kind in renderers}
+        for turn in range(options.repeats + 1):
+            for kind, draw in renderers.items():
+                taken = _timed(draw)[1]
+                # The first reads meshes.
+                if turn:
+                    seconds[kind].append(taken)
+        for backend in opened.values():
+            backend.close()
+        figures[name] = {kind: 1e3 * statistics.median(each) for kind, each in seconds.items()}
+        _say(f"{name}: " + ", ".join(f"{k} {v:.1f} ms" for k, v in figures[name].items()))
+    return {"image_size": size, "repeats": options.repeats, "image_ms": figures}
+
+
+def _tiny_renderer(
+    robot: RobotSpec, scene: SceneSpec, state: SceneState, size: int
+) -> Callable[[], Any]:
+    """What has PyBullet's TinyRenderer draw a state by the wrist camera."""
+    import pybullet as p
+    from pybullet_utils.bullet_client import BulletClient
+
+    model = RobotModel(robot, scene.held)
+    client: Any = BulletClient(p.DIRECT)
+    arm = client.loadURDF(str(model.urdf), useFixedBase=True)
+    positions = dict(zip(robot.arm_joints, state.q, strict=True))
+    positions |= robot.gripper.joint_positions(state.gripper)
+    for joint in range(client.getNumJoints(arm)):
+        name = client.getJointInfo(arm, joint)[1].decode()
+        client.resetJointState(arm, joint, positions.get(name, 0.0))
+    for body in scene.bodies:
+        for shape in body.shapes:
+            mesh = shape_mesh(shape)
+            T = state.Ts_world_body[body.name]
+            drawn = client.createVisualShape(
+                p.GEOM_MESH,
+                vertices=mesh.vertices.tolist(),
+                indices=mesh.triangles.ravel().tolist(),
+                rgbaColor=shape.rgba,
+            )
+            at, turned = T[:3, 3].tolist(), Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+            client.createMultiBody(0, -1, drawn, at, turned)
+    camera = next(camera for camera in robot.cameras if camera.name == "wrist")
+    T_world_camera = model.fk(state.q, camera.frame) @ camera.T_frame_camera
+    # OpenGL's camera looks along -z with y up.
+    view = inverse(T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    projection = p.computeProjectionMatrixFOV(camera.fov_y_deg, 1.0, camera.near, camera.far)
+
+    def draw() -> Any:
+        return client.getCameraImage(
+            size,
+            size,
+            view.T.ravel().tolist(),
+            projection,
+            shadow=0,
+            flags=p.ER_NO_SEGMENTATION_MASK,
+            renderer=p.ER_TINY_RENDERER,
+        )
+
+    return draw
+
+
 # --- the annotator ------------------------------------------------------------------------------
 
 # As a person would go: step, add, try radii, jump on, suggest, remove, undo.
@@ -957,7 +1280,10 @@ BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "augment": bench_augment,
     "certificate": bench_certificate,
     "dataset": bench_dataset,
+    "draw": bench_draw,
+    "plan": bench_plan,
     "step": bench_step,
+    "storage": bench_storage,
     "train": bench_train,
     "training-data": bench_training_data,
 }

@@ -569,8 +569,9 @@ def _change_hdf5(file: h5py.File, kind: str, rng: Rng, stranger: Path) -> None:
         del file[leaf]
         huge = (int(rng.choice([10**6, 10**9, 2**40])), *shape[1:])
         chunks = (1, *shape[1:]) if len(shape) > 2 else None
-        packed = {"compression": "lzf", "shuffle": True} if chunks else {}
-        file.create_dataset(leaf, huge, dtype, chunks=chunks, **packed)
+        shuffle = dtype.itemsize > 1
+        packed = {"compression": "gzip", "compression_opts": 1, "shuffle": shuffle}
+        file.create_dataset(leaf, huge, dtype, chunks=chunks, **(packed if chunks else {}))
     elif kind == "longer":
         array = file[leaf][()]
         del file[leaf]
@@ -606,7 +607,7 @@ def _change_hdf5(file: h5py.File, kind: str, rng: Rng, stranger: Path) -> None:
         array = file[leaf][()]
         if array.ndim:
             del file[leaf]
-            file.create_dataset(leaf, data=array, compression="gzip", chunks=True)
+            file.create_dataset(leaf, data=array, compression="lzf", chunks=True)
     elif kind == "attribute":
         file[name].attrs["x"] = rng.bytes(10)
     elif kind == "value":

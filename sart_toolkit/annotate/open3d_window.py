@@ -21,13 +21,13 @@ from PIL import Image as PillowImage
 
 from sart_toolkit.annotate.session import ACTIONS, AnnotationSession
 from sart_toolkit.annotate.verdict import Word
-from sart_toolkit.annotate.visuals import DrawnMesh, DrawnRobot, body_meshes
 from sart_toolkit.collision.cloud import CloudConfig, SceneCloud, fuse_cloud
 from sart_toolkit.data.records import Image, PrecisionSphere
 from sart_toolkit.errors import InvalidInput, MissingExtra
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals, shape_mesh
 from sart_toolkit.scenes.spec import SceneSpec
 
 try:
@@ -108,7 +108,7 @@ def annotate_in_window(
         # Twice as fine as for suggestions, which also count what is hidden.
         fine = CloudConfig(voxel=CloudConfig().voxel / 2, unknown="free")
         cloud = fuse_cloud(session.demonstration, robot, scene.held, config=fine)
-    drawn = DrawnRobot(RobotModel(robot, scene.held))
+    drawn = RobotVisuals(RobotModel(robot, scene.held))
     with _quiet_stdout():
         window = AnnotationWindow(session, drawn, scene, cloud, config or WindowConfig())
         window.run()
@@ -136,7 +136,7 @@ class AnnotationWindow:
     def __init__(
         self,
         session: AnnotationSession,
-        robot: DrawnRobot,
+        robot: RobotVisuals,
         scene: SceneSpec,
         cloud: SceneCloud | None,
         config: WindowConfig,
@@ -238,15 +238,16 @@ class AnnotationWindow:
         for body in self._scene.bodies:
             if body.name in self._session.demonstration.body_Ts_world:
                 T = self._session.demonstration.body_Ts_world[body.name][0]
-                for i, mesh in enumerate(body_meshes(body)):
+                for i, mesh in enumerate(map(shape_mesh, body.shapes)):
                     name = f"body {body.name} {i}"
                     add(name, _shaded(mesh, T), _plain())
                     self._bodies.append((name, body.name))
         steps = self._session.demonstration.steps
         gripper = float(np.clip(steps.measured_gripper[0], 0.0, 1.0))
-        Ts_part = self._robot.poses(steps.joint_positions[0], gripper)
-        for i, (mesh, T) in enumerate(zip(self._robot.meshes, Ts_part, strict=True)):
-            add(f"robot {i}", _shaded(mesh, T), _plain())
+        Ts_joint = self._robot.poses_at(steps.joint_positions[0], gripper)
+        for joint, meshes in self._robot.bodies.items():
+            for i, mesh in enumerate(meshes):
+                add(f"robot {joint} {i}", _shaded(mesh, Ts_joint[joint]), _plain())
         Ts = self._session.demonstration.steps.measured_Ts_world_tool
         add("path", _path(Ts[:, :3, 3], self._session.clearances), _line_material(5))
         add("triads", _triads(Ts, 0.008), _line_material(1.5))
@@ -259,8 +260,10 @@ class AnnotationWindow:
         steps, t = session.demonstration.steps, session.selected
         gripper = float(np.clip(steps.measured_gripper[t], 0.0, 1.0))
         q = steps.joint_positions[t]
-        for i, T in enumerate(self._robot.poses(q, gripper)):
-            scene.set_geometry_transform(f"robot {i}", T)
+        Ts_joint = self._robot.poses_at(q, gripper)
+        for joint, meshes in self._robot.bodies.items():
+            for i in range(len(meshes)):
+                scene.set_geometry_transform(f"robot {joint} {i}", Ts_joint[joint])
         for name, body in self._bodies:
             T = session.demonstration.body_Ts_world[body][t]
             scene.set_geometry_transform(name, T)
@@ -344,10 +347,10 @@ class AnnotationWindow:
             q = steps.joint_positions[sphere.waypoint]
             T_tool_world = inverse(steps.measured_Ts_world_tool[sphere.waypoint])
             tool = open3d.geometry.TriangleMesh()
-            Ts = self._robot.poses(q, gripper)
-            for i in self._robot.tool:
-                mesh = self._robot.meshes[i]
-                tool += _shaded(mesh, Ts[i]).transform(T_tool_world @ Ts[i])
+            Ts = self._robot.poses_at(q, gripper)
+            for joint in self._robot.tool:
+                for mesh in self._robot.bodies[joint]:
+                    tool += _shaded(mesh, Ts[joint]).transform(T_tool_world @ Ts[joint])
             tool.paint_uniform_color(_FAINT)
             tool = _textured(tool)
             for i in range(self._session.config.ghosts):
@@ -520,22 +523,18 @@ def _plain(point_size: float = 1.0) -> Any:
 
 
 def _shaded(mesh: DrawnMesh, T_world_mesh: Array) -> Any:
-    """A mesh of flat triangles, its light drawn on once, where it stands at `T_world_mesh`.
+    """A mesh, its light drawn on once, where it stands at `T_world_mesh`.
 
     A light that is computed for every image takes a CPU twice as long as all the rest.
     """
-    corners = mesh.vertices[mesh.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     towards_light = T_world_mesh[:3, :3].T @ _TOWARDS_LIGHT
-    bright = 0.72 + 0.28 * normals @ towards_light
+    bright = 0.72 + 0.28 * mesh.normals @ towards_light
     made = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(corners.reshape(-1, 3)),
-        open3d.utility.Vector3iVector(np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)),
+        open3d.utility.Vector3dVector(mesh.vertices),
+        open3d.utility.Vector3iVector(mesh.triangles.astype(np.int32)),
     )
-    colours = np.repeat(bright[:, None] * np.array(mesh.rgba[:3]), 3, axis=0)
-    made.vertex_colors = open3d.utility.Vector3dVector(colours)
-    made.vertex_normals = open3d.utility.Vector3dVector(np.repeat(normals, 3, axis=0))
+    made.vertex_colors = open3d.utility.Vector3dVector(bright[:, None] * np.array(mesh.rgba[:3]))
+    made.vertex_normals = open3d.utility.Vector3dVector(mesh.normals)
     return made
 
 

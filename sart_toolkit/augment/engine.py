@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -12,10 +11,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from sart_toolkit.augment import get_strategy
-from sart_toolkit.augment.allocation import allocate
+from sart_toolkit.augment.allocation import Allocation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import Spare, get_executor, no_spare
 from sart_toolkit.backends.interface import Backend, BackendFactory
@@ -24,19 +20,22 @@ from sart_toolkit.data.manifest import AttemptKey, EpisodeEntry, Rejection
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles, SphereShare, check_sources
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
+from sart_toolkit.workers.parcels import Output
 
 _log = logging.getLogger(__name__)
-_LEAST_ATTEMPTS = 20
-_ATTEMPTS_PER_EPISODE = 10
 
 
 class _Result(NamedTuple):
-    """What came of an attempt, small enough to go from one process to another."""
+    """What came of an attempt, small enough to go from one process to another.
+
+    `file`: where the kept episode is written.
+    """
 
     key: AttemptKey
     entry: EpisodeEntry | None
     rejection: Rejection
+    file: Path | None
     resets: int
 
 
@@ -47,11 +46,12 @@ class _Worker:
         self,
         make_backend: BackendFactory,
         sources: Sequence[Source],
-        files: EpisodeFiles,
+        out: Output,
         config: AugmentConfig,
         ask: Callable[[str], None] | None,
     ) -> None:
-        self._files = files
+        numbers = [source.number for source in sources]
+        self._out, self._files = out.path, EpisodeFiles(out.path, numbers)
         self._backend = make_backend()
         pairs = [(source.demonstration, source.annotation) for source in sources]
         demonstrations = [source.demonstration for source in sources]
@@ -62,11 +62,12 @@ class _Worker:
         """The results of attempts, one after the other, in the executor's order."""
         for attempt in self._executor.attempts(keys, spare):
             episode = attempt.episode
-            entry = None
+            entry = file = None
             if episode is not None:
                 entry = dataclasses.replace(self._files.write(episode), seconds=attempt.seconds)
+                file = self._out / entry.name
             rejection = Rejection(attempt.outcome, attempt.detail, attempt.seconds)
-            yield _Result(attempt.key, entry, rejection, attempt.resets)
+            yield _Result(attempt.key, entry, rejection, file, attempt.resets)
 
     def __call__(self, key: AttemptKey) -> _Result:
         (result,) = self.results([key])
@@ -82,7 +83,7 @@ def augment_demonstration(
     make_backend: BackendFactory,
     out: Path,
     config: AugmentConfig | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
     ask: Callable[[str], None] | None = None,
@@ -97,7 +98,7 @@ def augment_sources(
     make_backend: BackendFactory,
     out: Path,
     config: AugmentConfig | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
     ask: Callable[[str], None] | None = None,
@@ -114,7 +115,7 @@ def augment_sources(
         make_backend: makes the robot in the demonstrations' scene; picklable if `workers` > 1.
         out: directory to write.
         config: what to generate.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: replace what is in `out`.
         progress: called with (kept, wanted, rejected) after each attempt.
         ask: where the robot can't be reset: shows a person what to do, returns when it is done.
@@ -133,28 +134,17 @@ def augment_sources(
     config = config or AugmentConfig()
     # All that can be refused is refused before anything is replaced.
     check_sources(sources)
-    if workers < 1:
-        raise InvalidInput(f"workers: expected at least 1, got {workers}")
-    strategy = get_strategy(config.strategy)
-    drawn = [
-        (source, i, sphere)
-        for source, (demonstration, annotation) in enumerate(sources)
-        for i, sphere in enumerate(strategy.spheres(demonstration, annotation))
-    ]
-    wanted = _wanted(config, len(sources), strategy.draws)
-    weights = strategy.weights([sphere for *_, sphere in drawn], config.allocation)
-    shares = [
-        SphereShare(source, i, sphere.waypoint, share)
-        for (source, i, sphere), share in zip(drawn, allocate(wanted, weights), strict=True)
-    ]
+    workers = Workers.of(workers)
     demonstrations = [demonstration for demonstration, _ in sources]
+    allocation = Allocation(sources, config)
     with closing(make_backend()) as backend:
         executor = get_executor(config.execution, backend, demonstrations)
-        if workers > 1 and not executor.parallel:
+        if not workers.here and not executor.parallel:
             raise InvalidInput(
-                f"workers: executor {config.execution!r} needs 1 process, got {workers}"
+                f"workers: execution {config.execution!r} needs 1 process, got {workers.count} of "
+                f"executor {workers.executor!r}"
             )
-        if drawn:
+        if allocation.shares:
             executor.check(backend, demonstrations, config, ask)
         request = _request(backend, config)
     started = time.perf_counter()
@@ -164,74 +154,35 @@ def augment_sources(
 
         resumed = writer.n_kept + writer.n_rejected > 0
 
-        def missing() -> list[list[AttemptKey]]:
-            """The attempts still needed from each sphere, no more than can all be kept."""
-            most = []
-            for share in shares:
-                kept, made = writer.count(share.source, share.sphere)
-                most.append(kept if made >= _limit(share) else np.inf)
-            return [
-                writer.missing(share.source, share.sphere, quota, _limit(share))
-                for share, quota in zip(shares, allocate(wanted, weights, most), strict=True)
-            ]
-
         given: set[AttemptKey] = set()
 
         def spare(source: int, sphere: int) -> AttemptKey | None:
             """One more attempt from a sphere, if those under way can't be enough."""
-            further = [
-                key for keys in missing() for key in keys
-                if key[:2] == (source, sphere) and key not in given
-            ]  # fmt: skip
-            given.update(further[:1])
-            return further[0] if further else None
+            for key in allocation.missing(writer.tally):
+                if key[:2] == (source, sphere) and key not in given:
+                    given.add(key)
+                    return key
+            return None
 
         resets = 0
         make_worker = functools.partial(
-            _Worker, make_backend, writer.sources, writer.files, config, ask
+            _Worker, make_backend, writer.sources, Output(writer.path), config, ask
         )
         with _results(make_worker, workers) as results:
-            while keys := sorted(itertools.chain(*missing()), key=_by_number):
+            while keys := allocation.missing(writer.tally):
                 given.clear()
                 given.update(keys)
-                for key, entry, rejection, reset in results(keys, spare):
+                for key, entry, rejection, _, reset in results(keys, spare):
                     resets += reset
                     if entry is None:
                         writer.reject(key, rejection)
                     else:
                         writer.keep(entry)
                     if progress is not None:
-                        progress(writer.n_kept, wanted, writer.n_rejected)
+                        progress(writer.n_kept, allocation.wanted, writer.n_rejected)
         # How long an interrupted generation took in all, with how many resets, is not known.
-        seconds = None if resumed else time.perf_counter() - started
-        return _finish(writer, sources[0][0], config, shares, seconds, None if resumed else resets)
-
-
-def _wanted(config: AugmentConfig, demonstrations: int, draws: bool) -> int:
-    """How many trajectories are to be generated.
-
-    Raises:
-        InvalidInput: the demonstrations are too many, or other than n where nothing is drawn.
-    """
-    if draws and config.n <= demonstrations:
-        raise InvalidInput(
-            f"n: expected more than the {demonstrations} demonstrations, got {config.n}"
-        )
-    if not draws and config.n != demonstrations:
-        raise InvalidInput(
-            f"n: strategy {config.strategy!r} draws nothing, so expected the number of "
-            f"demonstrations ({demonstrations}), got {config.n}"
-        )
-    return config.n - demonstrations
-
-
-def _limit(share: SphereShare) -> int:
-    """How many attempts a sphere has; a share is not asked of it again and again in vain."""
-    return max(_LEAST_ATTEMPTS, _ATTEMPTS_PER_EPISODE * (share.wanted or 0))
-
-
-def _by_number(key: AttemptKey) -> tuple[int, int, int]:
-    return key.k, key.source, key.sphere
+        seconds, counted = (None, None) if resumed else (time.perf_counter() - started, resets)
+        return _finish(writer, sources[0][0], config, allocation.shares, seconds, counted)
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
@@ -245,14 +196,14 @@ def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
 
 @contextmanager
 def _results(
-    make_worker: Callable[[], _Worker], processes: int
+    make_worker: Callable[[], _Worker], workers: Workers
 ) -> Iterator[Callable[[Iterable[AttemptKey], Spare], Iterator[_Result]]]:
     """A function that makes attempts; a single process makes them in its executor's order."""
-    if processes == 1:
+    if workers.here:
         with closing(make_worker()) as worker:
             yield worker.results
     else:
-        with worker_map(make_worker, processes) as run:
+        with worker_map(make_worker, workers) as run:
             yield lambda keys, spare: run(keys)
 
 

@@ -28,9 +28,6 @@ from sart_toolkit.poses import Array, inverse
 from sart_toolkit.record.recorder import StepRecorder
 from sart_toolkit.scenes.spec import SceneSpec
 
-# How far [m] bodies may be from where they were on a way out and back, which takes twice as long:
-# what rests on a table creeps by 0.02 mm/s in PyBullet.
-OUT_AND_BACK_STILLNESS = 2 * BODY_STILLNESS
 # At rest, no joint is faster [rad/s]; how long [s] the robot has for it.
 _REST_SPEED, _LONGEST_REST = 0.01, 2.0
 # Where only the force is sensed, by how much [N] more than at the start means a contact.

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.execution import (
-    OUT_AND_BACK_STILLNESS,
     SegmentRun,
     recorded_cameras,
     segment_proof,
@@ -17,7 +16,6 @@ from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.augment.strategies import Proposal
 from sart_toolkit.backends.interface import Backend, SavesStates, require
 from sart_toolkit.collision.certificate import Certificate
-from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import Annotation, Demonstration, Episode, Provenance, Steps
 from sart_toolkit.errors import Mismatch, MotionRejected, Unreachable
@@ -176,13 +174,18 @@ class SegmentExecutor(abc.ABC):
         return Episode(steps, provenance, path)
 
 
+def rejected_outcome(error: Unreachable | MotionRejected) -> str:
+    """The outcome of an attempt that ended with an error: the same for all that fail alike."""
+    # What stands behind the colon differs each time.
+    return "out of reach" if isinstance(error, Unreachable) else str(error).partition(":")[0]
+
+
 def rejected(
     key: AttemptKey, error: Unreachable | MotionRejected, run: SegmentRun | None = None
 ) -> Attempt:
     """The attempt that an error ended, `run` being what was executed of it."""
-    # What stands behind the colon differs each time.
-    outcome = "out of reach" if isinstance(error, Unreachable) else str(error).partition(":")[0]
-    return Attempt(key, outcome, None, str(error), 0.0 if run is None else run.seconds)
+    outcome, seconds = rejected_outcome(error), 0.0 if run is None else run.seconds
+    return Attempt(key, outcome, None, str(error), seconds)
 
 
 class RestoreExecutor(SegmentExecutor):
@@ -235,16 +238,14 @@ class RestoreExecutor(SegmentExecutor):
         demonstration = self._sources[key.source][0]
         proposal, rng = planner.proposal(key.sphere, key.k)
         t = proposal.t_star
-        back = self._config.recording == "return"
-        stillness = OUT_AND_BACK_STILLNESS if back else BODY_STILLNESS
         run: SegmentRun | None = None
         try:
-            motion, certificate = planner.plan(proposal, rng, self.tracking_error, stillness)
+            motion, certificate = planner.plan(proposal, rng, self.tracking_error)
             require(self._backend, SavesStates, _FROM_STATES).restore(demonstration.states[t])
-            run = SegmentRun(self._backend, planner, t, self._config, stillness)
+            run = SegmentRun(self._backend, planner, t, self._config, planner.stillness)
             run.execute(planner.approach(t), motion)
             episode = self._episode(
-                key, proposal, motion, certificate, run.steps(), run.joint_path, stillness
+                key, proposal, motion, certificate, run.steps(), run.joint_path, planner.stillness
             )
         except (Unreachable, MotionRejected) as error:
             return rejected(key, error, run)

@@ -10,7 +10,7 @@ from sart_toolkit.augment.strategies import Proposal
 from sart_toolkit.collision import make_world
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
-from sart_toolkit.collision.phases import BODY_STILLNESS
+from sart_toolkit.collision.phases import BODY_STILLNESS, OUT_AND_BACK_STILLNESS
 from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import MotionRejected, Unreachable
@@ -62,7 +62,17 @@ class SegmentPlanner:
         demonstration, sampling = self.world.demonstration, self._config.sampling
         return strategy.propose(demonstration, self._spheres, sphere, rng, sampling), rng
 
-    def measured_margin(self, stillness: float = BODY_STILLNESS) -> float:
+    @property
+    def stillness(self) -> float:
+        """How far [m] bodies may be from where the demonstration has them, unless more is needed.
+
+        What rests on a table creeps, and a way out and back takes twice as long.
+        """
+        config = self._config
+        back = config.recording == "return" or config.execution == "replay"
+        return OUT_AND_BACK_STILLNESS if back else BODY_STILLNESS
+
+    def measured_margin(self, stillness: float) -> float:
         """What a measured path has to keep free [m]: `margin`, and what bodies may have moved."""
         return round(self._config.margin + stillness, _DIGITS)
 
@@ -87,7 +97,7 @@ class SegmentPlanner:
         proposal: Proposal,
         rng: np.random.Generator,
         tracking_error: float,
-        stillness: float = BODY_STILLNESS,
+        stillness: float | None = None,
     ) -> tuple[Motion, Certificate]:
         """The motion from waypoint t* to a drawn pose, and the proof that it keeps the margin.
 
@@ -99,7 +109,8 @@ class SegmentPlanner:
             proposal: what `proposal` drew.
             rng: the random numbers that follow it.
             tracking_error: how far [m] any point of the robot may be from its commanded path.
-            stillness: how far [m] bodies may be from where the demonstration has them.
+            stillness: how far [m] bodies may be from where the demonstration has them; the
+                planner's if left out.
 
         Raises:
             Unreachable: no joint configuration reaches some pose.
@@ -107,6 +118,7 @@ class SegmentPlanner:
                 at t*.
         """
         config, t = self._config, proposal.t_star
+        stillness = self.stillness if stillness is None else stillness
         margin = round(self.measured_margin(stillness) + tracking_error, _DIGITS)
         demonstration = self.world.demonstration
         steps, record_hz = demonstration.steps, demonstration.rates.record_hz

@@ -12,7 +12,6 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.execution import (
-    OUT_AND_BACK_STILLNESS,
     DisturbanceCheck,
     SegmentRun,
     check_untouched,
@@ -22,6 +21,7 @@ from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.strategies import Proposal
 from sart_toolkit.backends.interface import Backend, Resets, SensesContacts
 from sart_toolkit.collision.certificate import Certificate
+from sart_toolkit.collision.phases import OUT_AND_BACK_STILLNESS
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import Mismatch, MissingCapability, MotionRejected, Unreachable
@@ -453,7 +453,9 @@ def bring_back(
         if np.abs(here - goal).max() <= _AT_START:
             return
         motion = _joint_line(world.kinematics, here, goal, rates.record_hz)
-        proof = world.certify(0, motion.path, planner.measured_margin() + backend.tracking_error)
+        proof = world.certify(
+            0, motion.path, planner.measured_margin(planner.stillness) + backend.tracking_error
+        )
         if proof.verdict == "free":
             targets = motion.joints(motion.times(rates.physics_hz))
             for rows in targets.reshape(-1, rates.physics_per_control, targets.shape[1]):

@@ -20,18 +20,18 @@ from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.dataset import REPLAY, load_dataset
 from sart_toolkit.data.records import Episode, apply_action, library_versions
 from sart_toolkit.data.result_log import ResultLog
-from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
+from sart_toolkit.errors import MotionRejected, Unreachable
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.poses import distance
 from sart_toolkit.tasks.task import Task
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
 
 
 def replay_dataset(
     path: Path,
     task: Task,
     make_backend: BackendFactory,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def replay_dataset(
         path: directory from `sart augment`.
         task: judges the success.
         make_backend: makes the robot in the task's scene; picklable if `workers` > 1.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: replace `replay.json`, and forget what was executed before.
         progress: called with (done, all, failed) after each trajectory.
 
@@ -59,8 +59,7 @@ def replay_dataset(
         Mismatch: an execution with another task or backend was interrupted.
         CannotWrite: another process is at work on it, or the disk refuses.
     """
-    if workers < 1:
-        raise InvalidInput(f"workers: expected at least 1, got {workers}")
+    workers = Workers.of(workers)
     dataset = load_dataset(path)
     make_worker = functools.partial(_Worker, path, task, make_backend)
     with contextlib.ExitStack() as stack:
@@ -72,7 +71,7 @@ def replay_dataset(
         }
         log = stack.enter_context(ResultLog(path / REPLAY, request, overwrite))
         run: Callable[[Iterable[int]], Iterator[dict[str, Any]]] = functools.partial(map, worker)
-        if workers > 1:
+        if not workers.here:
             run = stack.enter_context(worker_map(make_worker, workers))
         rows = {row["index"]: row for row in log.rows}
         failed = sum(row["success"] is False for row in rows.values())

@@ -1,13 +1,13 @@
-"""PyBullet behind the `Backend` interface, with all abilities; images by its CPU renderer."""
+"""PyBullet behind the `Backend` interface, with all abilities; images by ray casting."""
 
 from __future__ import annotations
 
 import ctypes
-import dataclasses
+import functools
 import os
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -21,6 +21,7 @@ from sart_toolkit.backends.interface import (
     Observation,
     Simulator,
 )
+from sart_toolkit.backends.raycast import RayCaster
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
 from sart_toolkit.backends.targets import PeriodTargets
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
@@ -34,6 +35,7 @@ from sart_toolkit.robots.spec import (
     check_image_size,
 )
 from sart_toolkit.robots.urdf import add_joint, rigid_link
+from sart_toolkit.robots.visuals import RobotVisuals, shape_mesh
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 
 
@@ -57,12 +59,27 @@ def _without_greetings() -> Iterator[None]:
 
 with _without_greetings():
     import pybullet as p
-    from pybullet_utils.bullet_client import BulletClient
 
 # As a prism, which is what a cylinder becomes otherwise, it would be a millimetre larger.
-_URDF_FLAGS = p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_IMPLICIT_CYLINDER
-# OpenGL's camera looks along -z with y up; ours looks along z with y down.
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_URDF_FLAGS = (
+    p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_IMPLICIT_CYLINDER | p.URDF_IGNORE_VISUAL_SHAPES
+)
+# The gripper is drawn with its joints at the nearest multiples [rad or m] of this, hundredths of a
+# pixel away: they are never quite at rest, and what moves with the camera is drawn once.
+_GRIPPER_STEP = 5e-5
+_MOST_FOUND = 32
+
+
+class _Client:
+    """PyBullet's functions, each bound to one simulation when first used."""
+
+    def __init__(self) -> None:
+        self._id = p.connect(p.DIRECT)
+
+    def __getattr__(self, name: str) -> Any:
+        bound = functools.partial(getattr(p, name), physicsClientId=self._id)
+        setattr(self, name, bound)
+        return bound
 
 
 class PyBulletBackend(Simulator):
@@ -90,7 +107,7 @@ class PyBulletBackend(Simulator):
         super().__init__(robot, scene, image_size, rates)
         self._model = RobotModel(robot, scene.held)
         with _without_greetings():
-            self._client: Any = BulletClient(p.DIRECT)
+            self._client: Any = _Client()
         c = self._client
         c.setTimeStep(1.0 / rates.physics_hz)
         c.setGravity(*scene.gravity)
@@ -102,6 +119,9 @@ class PyBulletBackend(Simulator):
         self._bodies: dict[str, tuple[int, int]] = {}
         self._springs: list[tuple[int, int, Joint]] = []
         self._Ts_body_centre: dict[int, Array] = {}
+        self._Ts_centre_body: dict[int, Array] = {}
+        # Where bodies are that stay where a reset or restore has put them.
+        self._still: dict[str, Array] = {}
         for body in scene.bodies:
             if body.joint is None:
                 self._load_bodies(body)
@@ -118,8 +138,7 @@ class PyBulletBackend(Simulator):
         self._time = 0.0
         self._scene_digest = scene_digest(self._model, scene)
         self._targets = PeriodTargets(self._model, rates.physics_per_control)
-        # Another world with the same in it, where states are drawn.
-        self._stage: PyBulletBackend | None = None
+        self._drawing: _Drawing | None = None
         # The bytes restored last, until something changes: Bullet renumbers contacts each time.
         self._restored: bytes | None = None
 
@@ -133,6 +152,7 @@ class PyBulletBackend(Simulator):
         # PyBullet's base is a body's centre of mass with its principal axes.
         dynamics = c.getDynamicsInfo(index, -1)
         self._Ts_body_centre[index] = _matrix(dynamics[3], dynamics[4])
+        self._Ts_centre_body[index] = inverse(self._Ts_body_centre[index])
         for link in range(c.getNumJoints(index)):
             body = moving[c.getJointInfo(index, link)[12].decode()]
             assert body.joint is not None
@@ -243,67 +263,66 @@ class PyBulletBackend(Simulator):
         self.check_cameras(cameras)
         states = c.getJointStates(self._robot, self._arm)
         closed = self.robot.gripper.closed_position
+        T_world_tool, Ts_world_body = self._poses()
+        views = {}
+        if cameras:
+            linkage = c.getJointStates(self._robot, list(self._gripper.values()))
+            drawing = self._open_drawing()
+            drawing.place(
+                dict(zip(self.robot.arm_joints, (s[0] for s in states), strict=True)),
+                dict(zip(self._gripper, (s[0] for s in linkage), strict=True)),
+                Ts_world_body,
+            )
+            views = {name: drawing.view(self.cameras[name], size) for name in cameras}
         return Observation(
             q=np.array([s[0] for s in states]),
             dq=np.array([s[1] for s in states]),
             gripper=c.getJointState(self._robot, self._driver)[0] / closed,
-            T_world_tool=self._frame_pose(self.robot.tool_frame),
+            T_world_tool=T_world_tool,
             time=self._time,
-            cameras={name: self._image(self.cameras[name], *size) for name in cameras},
-            Ts_world_body=self.body_poses(),
+            cameras=views,
+            Ts_world_body=Ts_world_body,
             joint_path=np.array(self._joint_path),
         )
 
     def body_poses(self) -> dict[str, Array]:
-        Ts = {body.name: self._frame_pose(body.name) for body in self.scene.held}
+        return self._poses()[1]
+
+    def _poses(self) -> tuple[Array, dict[str, Array]]:
+        """Where the tool is, and where the bodies are."""
+        c = self._client
+        links = [self._tool_link, *(self._links[body.name] for body in self.scene.held)]
+        T_world_tool, *held = (
+            _matrix(state[4], state[5]) for state in c.getLinkStates(self._robot, links, 0, 1)
+        )
+        Ts = {body.name: T for body, T in zip(self.scene.held, held, strict=True)}
         for name, (index, link) in self._bodies.items():
             if link >= 0:
-                Ts[name] = self._link_pose(index, link)
+                state = c.getLinkState(index, link, 0, 1)
+                Ts[name] = _matrix(state[4], state[5])
+            elif name in self._still:
+                Ts[name] = self._still[name].copy()
             else:
-                T_world_centre = _matrix(*self._client.getBasePositionAndOrientation(index))
-                Ts[name] = T_world_centre @ inverse(self._Ts_body_centre[index])
-        return Ts
-
-    def _frame_pose(self, frame: str) -> Array:
-        """Where a frame of the robot, or "world", is."""
-        link = -1 if frame == "world" else self._links[frame]
-        # The robot's base stands at the world's origin.
-        return np.eye(4) if link < 0 else self._link_pose(self._robot, link)
-
-    def _link_pose(self, index: int, link: int) -> Array:
-        state = self._client.getLinkState(index, link, 0, 1)
-        return _matrix(state[4], state[5])
+                T_world_centre = _matrix(*c.getBasePositionAndOrientation(index))
+                Ts[name] = T_world_centre @ self._Ts_centre_body[index]
+        return T_world_tool, Ts
 
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
         q = self._model.check_limits(state.q)
         self.scene.check_state(state)
-        if self._stage is None:
-            self._stage = type(self)(self.robot, self.scene, self.image_size, self.rates)
-        self._stage._place(dataclasses.replace(state, q=q))
-        return self._stage._image(camera, *check_image_size((width, height)))
-
-    def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
-        T_world_camera = self._frame_pose(camera.frame) @ camera.T_frame_camera
-        near, far, light = camera.near, camera.far, self.scene.light
-        view = inverse(T_world_camera @ _FLIP)
-        _, _, rgb, buffer, _ = self._client.getCameraImage(
-            width,
-            height,
-            view.T.ravel().tolist(),
-            _projection(camera.fov_y_deg, near, far, width, height),
-            shadow=0,
-            lightDirection=light.direction.tolist(),
-            lightAmbientCoeff=light.ambient,
-            lightDiffuseCoeff=light.intensity,
-            flags=p.ER_NO_SEGMENTATION_MASK,
-            renderer=p.ER_TINY_RENDERER,
+        drawing = self._open_drawing()
+        drawing.place(
+            dict(zip(self.robot.arm_joints, q, strict=True)),
+            self.robot.gripper.joint_positions(state.gripper),
+            state.Ts_world_body,
         )
-        rgb = np.asarray(rgb, np.uint8).reshape(height, width, 4)[:, :, :3]
-        z = np.asarray(buffer, np.float64).reshape(height, width)
-        depth = near * far / (far - (far - near) * z)
-        # What nothing was drawn over keeps the buffer's far plane, give or take a rounding.
-        depth[depth >= far * (1 - 1e-4)] = 0.0
-        return CameraView(np.ascontiguousarray(rgb), depth.astype(np.float32), T_world_camera)
+        return drawing.view(camera, check_image_size((width, height)))
+
+    def _open_drawing(self) -> _Drawing:
+        """What draws robot and scene, whose meshes are read when first needed."""
+        if self._drawing is None:
+            self._drawing = _Drawing(self._model, self.scene)
+        return self._drawing
 
     def command(self, q: Array, gripper: float) -> CommandSent:
         sent = self._targets.command(q, gripper)
@@ -311,19 +330,19 @@ class PyBulletBackend(Simulator):
         return sent
 
     def step(self) -> None:
-        c, robot = self._client, self._robot
-        arm, n = self._arm, len(self._arm)
-        ones = [1.0] * n
+        c, robot, arm = self._client, self._robot, self._arm
+        n = len(arm)
+        ones, zeros = [1.0] * n, [0.0] * n
         gripper = self.robot.gripper
         self._touched = {}
         self._joint_path = []
         self._restored = None
-        for target in self._targets.rows:
+        for target in self._targets.rows.tolist():
             # Position gain 1 closes the whole error within one physics step. A velocity target
             # beside it would put the arm one physics step ahead of its targets.
             c.setJointMotorControlArray(
-                robot, arm, p.POSITION_CONTROL, target[:n].tolist(),
-                targetVelocities=[0.0] * n,
+                robot, arm, p.POSITION_CONTROL, target[:n],
+                targetVelocities=zeros,
                 forces=self._forces, positionGains=ones, velocityGains=ones,
             )  # fmt: skip
             c.setJointMotorControl2(
@@ -335,13 +354,15 @@ class PyBulletBackend(Simulator):
                 c.setJointMotorControl2(index, link, p.TORQUE_CONTROL, force=effort)
             c.stepSimulation()
             self._joint_path.append([s[0] for s in c.getJointStates(robot, arm)])
-            self._collect_contacts()
+            points = c.getContactPoints()
+            if points:
+                self._collect_contacts(points)
         self._targets.advance()
         self._time += 1.0 / self.rates.control_hz
 
-    def _collect_contacts(self) -> None:
+    def _collect_contacts(self, points: Sequence[Any]) -> None:
         forces: dict[tuple[str, str], float] = {}
-        for point in self._client.getContactPoints():
+        for point in points:
             distance, force = point[8], point[9]
             if distance > 0.0 and force <= 0.0:
                 continue
@@ -397,15 +418,69 @@ class PyBulletBackend(Simulator):
         self._time = head["time"]
         self._touched = {}
         self._joint_path = []
+        self._still = {}
+        Ts_world_body = self.body_poses()
+        self._still = {b.name: Ts_world_body[b.name] for b in self.scene.bodies if b.mass is None}
         self._restored = state
 
     def close(self) -> None:
-        if self._stage is not None:
-            self._stage.close()
         if self._client is not None:
             with suppress(p.error):
                 self._client.disconnect()
             self._client = None
+
+
+class _Drawing:
+    """A robot in its scene as it is drawn, wherever they are put."""
+
+    def __init__(self, model: RobotModel, scene: SceneSpec) -> None:
+        self._robot = RobotVisuals(model)
+        bodies = {f"joint {name}": meshes for name, meshes in self._robot.bodies.items()}
+        for body in scene.bodies:
+            bodies[f"body {body.name}"] = tuple(shape_mesh(shape) for shape in body.shapes)
+        self._caster = RayCaster(bodies, scene.light)
+        self._found: dict[tuple[str, tuple[tuple[str, float], ...]], dict[str, Array]] = {}
+
+    def place(
+        self,
+        arm: Mapping[str, float],
+        gripper: Mapping[str, float],
+        Ts_world_body: Mapping[str, Array],
+    ) -> None:
+        """Put all where it is to be drawn.
+
+        Args:
+            arm, gripper: positions of the joints, by name.
+            Ts_world_body: poses `(4, 4)` of the scene's bodies.
+        """
+        rounded = {name: round(x / _GRIPPER_STEP) * _GRIPPER_STEP for name, x in gripper.items()}
+        self._Ts_world_joint = self._robot.poses({**arm, **rounded})
+        self._gripper = tuple(rounded.items())
+        self._Ts_world_body = {f"body {name}": T for name, T in Ts_world_body.items()}
+
+    def view(self, camera: CameraSpec, size: tuple[int, int]) -> CameraView:
+        """The image of a camera, which need not be one of the robot's or the scene's."""
+        joint, T_joint_frame = self._robot.mount(camera.frame)
+        return self._caster.view(
+            camera,
+            self._Ts_world_joint[joint] @ T_joint_frame,
+            size,
+            {f"joint {name}": T for name, T in self._Ts_world_joint.items()} | self._Ts_world_body,
+            self._tool_around(camera.frame, self._gripper) if joint in self._robot.tool else {},
+        )
+
+    def _tool_around(self, frame: str, gripper: tuple[tuple[str, float], ...]) -> dict[str, Array]:
+        """Where what moves with the tool is in one of its frames: the same wherever the arm is."""
+        if (frame, gripper) not in self._found:
+            if len(self._found) >= _MOST_FOUND:
+                self._found.clear()
+            Ts_arm_joint = self._robot.poses(dict(gripper))
+            joint, T_joint_frame = self._robot.mount(frame)
+            T_frame_arm = inverse(Ts_arm_joint[joint] @ T_joint_frame)
+            self._found[frame, gripper] = {
+                f"joint {name}": T_frame_arm @ Ts_arm_joint[name] for name in self._robot.tool
+            }
+        return self._found[frame, gripper]
 
 
 @contextmanager
@@ -431,22 +506,9 @@ def _urdf_file(root: Body, moving: Iterable[Body]) -> Iterator[str]:
         os.unlink(path)
 
 
-def _projection(fov_y_deg: float, near: float, far: float, width: int, height: int) -> list[float]:
-    """OpenGL's matrix, half a pixel off: TinyRenderer samples each pixel at its lower left corner.
-
-    So (0, 0) of the image is the centre of its first pixel, as `CameraSpec.intrinsics` says.
-    """
-    matrix = list(p.computeProjectionMatrixFOV(fov_y_deg, width / height, near, far))
-    matrix[8] += 1.0 / width
-    matrix[9] += 1.0 / height
-    return matrix
-
-
 def _matrix(position: Sequence[float], quaternion: Sequence[float]) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = np.array(p.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
-    T[:3, 3] = position
-    return T
+    R, (x, y, z) = p.getMatrixFromQuaternion(quaternion), position
+    return np.array([[*R[:3], x], [*R[3:6], y], [*R[6:], z], [0.0, 0.0, 0.0, 1.0]])
 
 
 def _quaternion(T: Array) -> list[float]:

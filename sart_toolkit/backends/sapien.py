@@ -1,4 +1,4 @@
-"""SAPIEN behind the `Backend` interface, with all abilities: PhysX, light and shadow."""
+"""SAPIEN behind the `Backend` interface, with all abilities: PhysX, images by its rasteriser."""
 
 from __future__ import annotations
 

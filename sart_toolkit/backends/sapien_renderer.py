@@ -269,7 +269,7 @@ ALONG_Z = sapien_axis(np.array([0.0, 0.0, 1.0]))
 
 
 class Renderer:
-    """A scene and robot as SAPIEN draws them: meshes, light and shadow, but nothing that moves.
+    """A scene and robot as SAPIEN draws them: meshes and light, but nothing that moves.
 
     Nothing here depends on the physics, so bodies are drawn wherever they are said to be.
     """
@@ -307,10 +307,11 @@ class Renderer:
         self._system.ambient_light = [light.ambient] * 3
         lamp = sapien.render.RenderDirectionalLightComponent()
         lamp.color = [light.intensity] * 3
+        # The shaders need a map of shadows; what it doesn't reach is lit.
         lamp.shadow = True
-        lamp.shadow_half_size = _SHADOW_REACH
+        lamp.shadow_half_size = _SHADOW_REACH if light.shadows else 1e-6
         lamp.shadow_near, lamp.shadow_far = 0.0, 4 * _SHADOW_REACH
-        lamp.shadow_map_size = _SHADOW_PIXELS
+        lamp.shadow_map_size = _SHADOW_PIXELS if light.shadows else 1
         T = sapien_axis(-light.direction)
         T[:3, 3] = 2 * _SHADOW_REACH * light.direction
         entity = sapien.Entity()

@@ -31,7 +31,7 @@ from sart_toolkit.record.session import record_demonstration
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.tasks.task import Placement
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
 
 # Where the two are compared, small radii count too.
 _LEAST_RADIUS = 0.0005
@@ -143,7 +143,7 @@ def benchmark_noise(
     out: Path,
     seed: int = 0,
     recordings: Mapping[str, Recording] = RECORDINGS,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
     about: Mapping[str, Any] = _NOTHING,
@@ -161,7 +161,7 @@ def benchmark_noise(
         out: JSON file to write; finished cells are kept beside it until all are done.
         seed: of the scripted operator and of the noise.
         recordings: the sensors by name.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: replace `out`, and forget finished cells.
         progress: called with (cells done, cells in all).
         about: what else is to stand in the file, such as the command.

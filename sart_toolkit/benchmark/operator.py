@@ -17,7 +17,7 @@ from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.errors import SartError
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def benchmark_operator(
     cells: Sequence[Cell],
     config: BenchmarkConfig,
     out: Path,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def benchmark_operator(
         cells: tasks on backends.
         config: how many episodes.
         out: JSON file to write.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: replace `out`, and forget finished episodes.
         progress: called with (done, wanted, successes) after each episode.
 

@@ -29,7 +29,7 @@ from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.poses import Array, exp_rotation, inverse
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _LARGEST_STEP = 1.5
@@ -356,7 +356,7 @@ def benchmark_radii(
     make_checker: MakeChecker,
     config: RadiiConfig,
     out: Path,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
     about: Mapping[str, Any] = _NOTHING,
@@ -374,7 +374,7 @@ def benchmark_radii(
         make_checker: makes the other model; picklable if `workers` > 1.
         config: how many draws.
         out: JSON file to write.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: replace `out`, and forget finished cells.
         progress: called with (done, wanted) after each cell.
         about: what else is to stand in the file, such as the command.

@@ -30,7 +30,7 @@ from sart_toolkit.data.result_log import ResultLog
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.record.session import SessionConfig
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -137,7 +137,7 @@ def benchmark_segments(
     cells: Sequence[Cell],
     config: SegmentsConfig,
     out: Path,
-    workers: int = 1,
+    workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
     about: Mapping[str, Any] = _NOTHING,
@@ -155,7 +155,7 @@ def benchmark_segments(
         cells: tasks on backends, each with all of the config's seeds.
         config: how many attempts, and the seeds.
         out: JSON file to write.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         overwrite: replace `out`, and forget finished attempts.
         progress: called with (done, wanted, kept) after each attempt.
         about: what else is to stand in the file, such as the command.

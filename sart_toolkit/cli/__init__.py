@@ -79,7 +79,8 @@ def _what_is_kept(words: list[str], number: int) -> str:
     """What an interrupted command leaves, and the command that resumes it."""
     by = signal.Signals(number).name
     interrupted = "interrupted" if number == signal.SIGINT else f"ended by {by}"
-    if not any(words[: len(verb)] == verb for verb in map(str.split, RESUMING)):
+    resumes = any(words[: len(verb)] == verb for verb in map(str.split, RESUMING))
+    if not resumes or "--dry-run" in words:
         return f"{interrupted}; an unfinished result isn't kept, type the same command again"
     # To overwrite again would drop what was kept since.
     again = shlex.join(["sart", *(word for word in words if word != "--overwrite")])

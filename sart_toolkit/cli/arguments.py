@@ -8,10 +8,27 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from sart_toolkit.augment import STRATEGIES
+from sart_toolkit.errors import InvalidInput
+
 
 def _optional(metavar: str, help: str) -> Any:
     """A flag that may be left out, what happens then being in its help."""
     return arg(metavar=metavar, help=help, help_behavior_hint="")
+
+
+def whole_numbers(flag: str, text: str) -> tuple[int, ...]:
+    """The numbers in a flag's comma-separated list.
+
+    Raises:
+        InvalidInput: something else is in it.
+    """
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError as error:
+        raise InvalidInput(
+            f"--{flag}: expected whole numbers separated by commas, got {text!r}"
+        ) from error
 
 
 _JSON = Annotated[bool, arg(name="json", help="Print the result as one JSON object on stdout.")]
@@ -35,7 +52,20 @@ _NOTED_BACKEND = Annotated[
     str | None, _optional("REF", f"Backend, as {_REF}; what the recording notes if left out.")
 ]
 _EPOCHS = Annotated[int | None, _optional("INT", "Training epochs; the policy's own if left out.")]
-_WORKERS = Annotated[int, arg(help="Processes to use.")]
+_WORKERS = Annotated[int, arg(help="Processes to use, or workers on the cluster.")]
+_EXECUTOR = Annotated[
+    Literal["processes", "ray"],
+    arg(help="What runs the workers: processes of this machine, or the nodes of a Ray cluster."),
+]
+_RAY_ADDRESS = Annotated[
+    str | None,
+    _optional(
+        "ADDRESS",
+        "With --executor ray: HOST:PORT of the cluster, auto for the one that this machine belongs "
+        "to, or local for one of this command's own; if left out RAY_ADDRESS, else auto, else "
+        "local.",
+    ),
+]
 _SEED = Annotated[int, arg(help="Seed of everything random in this step.")]
 _IMAGE = Annotated[
     str, arg(help="Size of recorded images [pixels]: 128, or width and height as in 160x120.")
@@ -48,8 +78,8 @@ _STRATEGY = Annotated[
     str,
     arg(
         metavar="REF",
-        help="sart: straight lines; sart_planned: round obstacles where these are blocked; an "
-        "ablation or baseline of docs/strategies.md, such as miles or bc; or your own.",
+        help=f"How segments are drawn, as in docs/strategies.md: {', '.join(STRATEGIES)}; or your "
+        "own.",
     ),
 ]
 _POLICY = Annotated[
@@ -58,6 +88,13 @@ _POLICY = Annotated[
         "REF",
         "Policy: compact_mlp, resnet18_mlp as in the paper, replay, or your own; what the strategy "
         "is for if left out (compact_mlp, or replay).",
+    ),
+]
+_RECORDING = Annotated[
+    Literal["reversed", "return"],
+    arg(
+        help="Which way is recorded: out, reversed as in the paper, or the return, on which "
+        "the robot lags behind its commands as it does when a policy acts."
     ),
 ]
 _N = Annotated[
@@ -157,8 +194,11 @@ class Run:
     cameras: _CAMERAS = "wrist"
     image_size: _IMAGE = "128"
     distribution: _DISTRIBUTION = "paper"
+    recording: _RECORDING = "reversed"
     epochs: _EPOCHS = None
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     device: _DEVICE = "auto"
     overwrite: _OVERWRITE = False
     json: _JSON = False
@@ -354,6 +394,8 @@ class Augment:
 
     Example: sart augment demos/*.h5 --out dataset --strategy bc
 
+    Example: sart augment demo.h5 annotation.json --out plan.jsonl --dry-run
+
     Each annotation finds its demonstration; trajectories are allocated to the spheres of all. With
     --source cloud, images are read as the annotation says, where its spheres were suggested from
     them; flags about the sensor replace that. An interrupted generation resumes when the same
@@ -368,7 +410,7 @@ class Augment:
             help_behavior_hint="",
         ),
     ]
-    out: Annotated[Path, arg(help="Directory to write.")]
+    out: Annotated[Path, arg(help="Directory to write; with --dry-run a file of JSON lines.")]
     n: _N = None
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
@@ -398,13 +440,7 @@ class Augment:
             "backend and demonstration allow.",
         ),
     ] = "auto"
-    recording: Annotated[
-        Literal["reversed", "return"],
-        arg(
-            help="Which way is recorded: out, reversed as in the paper, or the return, on which "
-            "the robot lags behind its commands as it does when a policy acts."
-        ),
-    ] = "reversed"
+    recording: _RECORDING = "reversed"
     source: _SOURCE = "scene"
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
@@ -418,7 +454,16 @@ class Augment:
     ] = 0.0002
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     seed: _SEED = 0
+    dry_run: Annotated[
+        bool,
+        arg(
+            help="Execute nothing: write the segments that would be attempted, each with its pose "
+            "and proof, or why it would be rejected."
+        ),
+    ] = False
     workers: _WORKERS = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -443,6 +488,67 @@ class Validate:
     backend: _NOTED_BACKEND = None
     replay: Annotated[bool, arg(help="Also execute every trajectory to the end.")] = False
     workers: _WORKERS = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Make one dataset of several of the same task, robot and cameras.
+
+    Example: sart merge dataset1 dataset2 --out both
+
+    Each part keeps its settings, so that the whole can be validated. Files are linked where the
+    disk can do that. Interrupted, it resumes when the same command is typed again.
+    """
+
+    datasets: Annotated[
+        Positional[tuple[Path, ...]],
+        arg(
+            metavar="DATASET [DATASET ...]",
+            help="Directories from `sart augment`, `merge` or `split`.",
+            help_behavior_hint="",
+        ),
+    ]
+    out: Annotated[Path, arg(help="Directory to write.")]
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Split:
+    """Make datasets of parts of one: for training and validation, smaller, or by demonstration.
+
+    Example: sart split dataset --out parts --parts train=0.8,validation=0.2
+
+    Example: sart split dataset --out small --n 20
+
+    Example: sart split dataset --out each --by-source
+
+    Of each sphere every part gets its share. Interrupted, it resumes when the same command is typed
+    again.
+    """
+
+    dataset: Annotated[
+        Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment` or `merge`.")
+    ]
+    out: Annotated[
+        Path, arg(help="Directory to write; with --n it is the dataset, otherwise OUT/NAME are.")
+    ]
+    parts: Annotated[
+        str | None,
+        _optional(
+            "NAME=FRACTION,...", "Parts by name, with the fraction of the episodes that each gets."
+        ),
+    ] = None
+    n: Annotated[
+        int | None,
+        _optional("INT", "One part of so many trajectories, the demonstrations among them."),
+    ] = None
+    by_source: Annotated[bool, arg(help="A part for each demonstration.")] = False
+    seed: Annotated[int, arg(help="Seed of which episodes the --parts get.")] = 0
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -457,12 +563,16 @@ class Train:
         --schedule cosine --image-size 64
 
     Example: sart train dataset --out skill --cameras wrist,overview
+
+    Example: sart train dataset --out skills --seeds 0,1,2 --workers 3
+
+    With --seeds there is a skill for each, OUT/seed0 and so on, and a table in OUT/sweep.json.
     """
 
     dataset: Annotated[
         Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment`.")
     ]
-    out: Annotated[Path, arg(help="Skill directory to write.")]
+    out: Annotated[Path, arg(help="Directory to write: the skill, or with --seeds one for each.")]
     policy: _POLICY = None
     epochs: _EPOCHS = None
     lr: Annotated[
@@ -498,8 +608,22 @@ class Train:
             "File with ResNet18 weights (torchvision's names) to start from; none if left out.",
         ),
     ] = None
-    seed: _SEED = 0
+    seed: Annotated[
+        int | None, _optional("INT", "Seed of everything random in this step; 0 if left out.")
+    ] = None
+    seeds: Annotated[
+        str | None,
+        _optional(
+            "INT,INT...",
+            "Comma-separated seeds, to train a skill with each; one skill if left out.",
+        ),
+    ] = None
     device: _DEVICE = "auto"
+    workers: Annotated[
+        int, arg(help="Processes to use, or workers on the cluster, with --seeds.")
+    ] = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -526,6 +650,8 @@ class Evaluate:
     vary_appearance: _APPEARANCE = False
     videos: Annotated[int, arg(help="Videos of the first successes, and as many of failures.")] = 2
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     device: _DEVICE = "cpu"
     overwrite: _OVERWRITE = False
     json: _JSON = False
@@ -550,6 +676,8 @@ class BenchmarkOperator:
     yaw_deg: _YAW = 0.0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_operator.json")
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -599,6 +727,8 @@ class BenchmarkSegments:
     ] = "0"
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_segments.json")
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -622,6 +752,8 @@ class BenchmarkRadii:
     seed: _SEED = 0
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_radii.json")
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -645,7 +777,11 @@ class BenchmarkCloud:
     backends: _BACKENDS = "pybullet"
     seed: _SEED = 0
     noise: Annotated[int, arg(help="Noise draws for each task and sensor; 0: images as drawn.")] = 0
-    workers: Annotated[int, arg(help="Processes to use, with --noise.")] = 1
+    workers: Annotated[
+        int, arg(help="Processes to use, or workers on the cluster, with --noise.")
+    ] = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     out: Annotated[Path, arg(help="JSON file to write.")] = Path("runs/benchmark_cloud.json")
     overwrite: _OVERWRITE = False
     json: _JSON = False
@@ -674,6 +810,8 @@ class BenchmarkSkill:
     seed: _SEED = 0
     eval_seed: _EVAL_SEED = 1000
     workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
     device: _DEVICE = "auto"
     json: _JSON = False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sys
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from sart_toolkit.cli.arguments import Augment, Validate
 from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
+from sart_toolkit.cli.workers import chosen_workers
 from sart_toolkit.data.dataset import REPLAY
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.data.storage import check_writable
@@ -25,30 +27,36 @@ def augment_verb(args: Augment) -> dict[str, Any]:
     demos = [path for path in args.files if path not in annotations]
     if not demos:
         raise InvalidInput("FILE: expected a demonstration, got annotations alone; add its .h5")
+    options: dict[str, Any] = {
+        "task": args.task,
+        "robot": args.robot,
+        "backend": args.backend,
+        "workers": chosen_workers(args),
+        "overwrite": args.overwrite,
+        "sensor": sensor,
+        **({} if args.n is None else {"n": args.n}),
+        "allocation": args.allocation,
+        "strategy": args.strategy,
+        "sampling": SamplingConfig(args.distribution, args.rotation_per_metre),
+        "duration": args.duration,
+        "execution": args.execution,
+        "recording": args.recording,
+        "margin": args.margin,
+        "slip_tolerance": args.slip_tolerance,
+        "obstacles": args.source,
+        "seed": args.seed,
+    }
     with ProgressDisplay() as progress:
+        if args.dry_run:
+            planned = pipeline.preview(demos, annotations, args.out, progress=progress, **options)
+            return {"plan": str(args.out), **dataclasses.asdict(planned)}
         dataset = pipeline.augment(
             demos,
             annotations,
             args.out,
-            task=args.task,
-            robot=args.robot,
-            backend=args.backend,
-            workers=args.workers,
-            overwrite=args.overwrite,
             progress=progress,
-            sensor=sensor,
             ask=_ask if sys.stdin.isatty() else None,
-            **({} if args.n is None else {"n": args.n}),
-            allocation=args.allocation,
-            strategy=args.strategy,
-            sampling=SamplingConfig(args.distribution, args.rotation_per_metre),
-            duration=args.duration,
-            execution=args.execution,
-            recording=args.recording,
-            margin=args.margin,
-            slip_tolerance=args.slip_tolerance,
-            obstacles=args.source,
-            seed=args.seed,
+            **options,
         )
     return {"dataset": str(args.out), **describe_dataset(dataset)}
 
@@ -65,6 +73,8 @@ def validate_verb(args: Validate) -> dict[str, Any]:
         for flag, given in (
             ("backend", args.backend is not None),
             ("workers", args.workers != 1),
+            ("executor", args.executor != "processes"),
+            ("ray-address", args.ray_address is not None),
             ("overwrite", args.overwrite),
         ):
             if given:
@@ -80,7 +90,7 @@ def validate_verb(args: Validate) -> dict[str, Any]:
                 task=args.task,
                 robot=args.robot,
                 backend=args.backend,
-                workers=args.workers,
+                workers=chosen_workers(args),
                 overwrite=args.overwrite,
                 progress=progress,
             )

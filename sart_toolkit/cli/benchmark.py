@@ -14,9 +14,11 @@ from sart_toolkit.cli.arguments import (
     BenchmarkReplay,
     BenchmarkSegments,
     BenchmarkSkill,
+    whole_numbers,
 )
 from sart_toolkit.cli.console import ProgressDisplay, say, typed
 from sart_toolkit.cli.info import plain
+from sart_toolkit.cli.workers import chosen_workers
 from sart_toolkit.data.records import library_versions
 from sart_toolkit.data.schemas import EvaluationFile
 from sart_toolkit.data.storage import OutputLock, check_writable, read_json, write_json
@@ -24,6 +26,7 @@ from sart_toolkit.doctor import machine
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks import TASKS, get_task
+from sart_toolkit.workers import Workers
 
 if TYPE_CHECKING:
     from sart_toolkit.benchmark.cells import Cell
@@ -62,7 +65,7 @@ def operator_verb(args: BenchmarkOperator) -> Result:
     config = BenchmarkConfig(args.episodes, args.seed, args.yaw_deg)
     with ProgressDisplay() as progress:
         result = benchmark_operator(
-            cells, config, args.out, args.workers, args.overwrite,
+            cells, config, args.out, chosen_workers(args), args.overwrite,
             lambda done, wanted, successes: progress(
                 "operator", done, wanted, f"{successes}/{done} succeeded"
             ),
@@ -104,10 +107,10 @@ def segments_verb(args: BenchmarkSegments) -> Result:
     cells = _cells(args.tasks, args.backends)
     from sart_toolkit.benchmark.segments import SegmentsConfig, benchmark_segments
 
-    config = SegmentsConfig(args.count, _seeds(args.seed), args.source)
+    config = SegmentsConfig(args.count, whole_numbers("seed", args.seed), args.source)
     with ProgressDisplay() as progress:
         result = benchmark_segments(
-            cells, config, args.out, args.workers, args.overwrite,
+            cells, config, args.out, chosen_workers(args), args.overwrite,
             lambda done, wanted, kept: progress("segments", done, wanted, f"{kept}/{done} kept"),
             _about(),
         )  # fmt: skip
@@ -125,16 +128,6 @@ def segments_verb(args: BenchmarkSegments) -> Result:
     }
 
 
-def _seeds(text: str) -> tuple[int, ...]:
-    """The seeds in a comma-separated list of whole numbers."""
-    try:
-        return tuple(int(word) for word in text.split(","))
-    except ValueError as error:
-        raise InvalidInput(
-            f"--seed: expected whole numbers separated by commas, got {text!r}"
-        ) from error
-
-
 def radii_verb(args: BenchmarkRadii) -> Result:
     """`sart benchmark radii`."""
     cells = _cells(args.tasks, args.backends)
@@ -144,7 +137,7 @@ def radii_verb(args: BenchmarkRadii) -> Result:
     config = RadiiConfig(args.draws, args.directed, seed=args.seed)
     with ProgressDisplay() as progress:
         result = benchmark_radii(
-            cells, ClosestPoints, config, args.out, args.workers, args.overwrite,
+            cells, ClosestPoints, config, args.out, chosen_workers(args), args.overwrite,
             lambda done, wanted: progress("radii", done, wanted), _about(),
         )  # fmt: skip
     return {"benchmark": str(args.out)} | {
@@ -162,12 +155,13 @@ def cloud_verb(args: BenchmarkCloud) -> Result:
     check_writable(args.out, args.overwrite)
     from sart_toolkit.benchmark.clouds import benchmark_clouds, benchmark_noise
 
-    if args.workers != 1 and not args.noise:
+    workers = chosen_workers(args)
+    if not workers.here and not args.noise:
         raise InvalidInput("--workers: radii without noise take one process; add --noise")
     if args.noise:
         with ProgressDisplay() as progress:
             result = benchmark_noise(
-                cells, args.noise, args.out, args.seed, workers=args.workers,
+                cells, args.noise, args.out, args.seed, workers=workers,
                 overwrite=args.overwrite,
                 progress=lambda done, wanted: progress("cloud", done, wanted), about=_about(),
             )  # fmt: skip
@@ -206,11 +200,12 @@ def _about() -> Result:
 def skill_verb(args: BenchmarkSkill) -> Result:
     """`sart benchmark skill`: one `sart run` after the other, then their figures."""
     pairs = _pairs(args.tasks, args.backends)
+    workers = chosen_workers(args)
     with OutputLock(args.out / "benchmark.json"):
-        return _skills(args, pairs)
+        return _skills(args, pairs, workers)
 
 
-def _skills(args: BenchmarkSkill, pairs: list[tuple[str, str]]) -> Result:
+def _skills(args: BenchmarkSkill, pairs: list[tuple[str, str]], workers: Workers) -> Result:
     rows: Result = {}
     for task, backend in pairs:
         at = get_task(task).name, get_backend(backend).name
@@ -227,7 +222,7 @@ def _skills(args: BenchmarkSkill, pairs: list[tuple[str, str]]) -> Result:
                 episodes=args.episodes,
                 seed=args.seed,
                 eval_seed=args.eval_seed,
-                workers=args.workers,
+                workers=workers,
                 device=args.device,
                 command=typed(),
                 progress=progress,

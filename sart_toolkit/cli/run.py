@@ -7,6 +7,7 @@ from typing import Any
 from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Report, Run
 from sart_toolkit.cli.console import ProgressDisplay, typed
+from sart_toolkit.cli.workers import chosen_workers
 
 
 def run_verb(args: Run) -> dict[str, Any]:
@@ -24,11 +25,12 @@ def run_verb(args: Run) -> dict[str, Any]:
             episodes=args.episodes,
             epochs=args.epochs,
             distribution=args.distribution,
+            recording=args.recording,
             cameras=args.cameras.split(","),
             image_size=args.image_size,
             seed=args.seed,
             eval_seed=args.eval_seed,
-            workers=args.workers,
+            workers=chosen_workers(args),
             device=args.device,
             overwrite=args.overwrite,
             command=typed(),

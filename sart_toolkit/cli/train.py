@@ -5,13 +5,33 @@ from __future__ import annotations
 from typing import Any
 
 from sart_toolkit import pipeline
-from sart_toolkit.cli.arguments import Evaluate, Train
+from sart_toolkit.cli.arguments import Evaluate, Train, whole_numbers
 from sart_toolkit.cli.console import ProgressDisplay
 from sart_toolkit.cli.info import describe_skill, without_rows
+from sart_toolkit.cli.workers import chosen_workers
+from sart_toolkit.errors import InvalidInput
+from sart_toolkit.workers import Workers
 
 
 def train_verb(args: Train) -> dict[str, Any]:
     """`sart train`."""
+    workers = chosen_workers(args)
+    options: dict[str, Any] = {
+        "epochs": args.epochs,
+        "lr": args.lr,
+        "batch_size": args.batch_size,
+        "image_size": args.image_size,
+        "image_shift": args.image_shift,
+        "schedule": args.schedule,
+        "norm": args.norm,
+        "cameras": tuple(args.cameras.split(",")),
+        "backbone_weights": args.backbone_weights and str(args.backbone_weights),
+        "device": args.device,
+    }
+    if args.seeds is not None:
+        return _sweep(args, workers, options)
+    if not workers.here:
+        raise InvalidInput("--workers: a single training takes one process; add --seeds")
     with ProgressDisplay() as progress:
         pipeline.train_policy(
             args.dataset,
@@ -19,19 +39,32 @@ def train_verb(args: Train) -> dict[str, Any]:
             args.policy,
             overwrite=args.overwrite,
             progress=progress,
-            epochs=args.epochs,
-            lr=args.lr,
-            batch_size=args.batch_size,
-            image_size=args.image_size,
-            image_shift=args.image_shift,
-            schedule=args.schedule,
-            norm=args.norm,
-            cameras=tuple(args.cameras.split(",")),
-            backbone_weights=args.backbone_weights and str(args.backbone_weights),
             seed=args.seed,
-            device=args.device,
+            **options,
         )
     return {"skill": str(args.out), **describe_skill(args.out)}
+
+
+def _sweep(args: Train, workers: Workers, options: dict[str, Any]) -> dict[str, Any]:
+    seeds = whole_numbers("seeds", args.seeds or "")
+    if args.seed is not None:
+        raise InvalidInput("--seed: is for a single training; leave it out, or --seeds")
+    with ProgressDisplay() as progress:
+        table = pipeline.train_seeds(
+            args.dataset,
+            args.out,
+            seeds,
+            args.policy,
+            workers=workers,
+            overwrite=args.overwrite,
+            progress=progress,
+            **options,
+        )
+    rows = {str(args.out / row["skill"]): row for row in table["skills"]}
+    return {"table": str(args.out / "sweep.json")} | {
+        name: f"loss {row['final_loss']:.4g} after {row['seconds']:.1f} s on {row['device']}"
+        for name, row in rows.items()
+    }
 
 
 def evaluate_verb(args: Evaluate) -> dict[str, Any]:
@@ -48,7 +81,7 @@ def evaluate_verb(args: Evaluate) -> dict[str, Any]:
             task=args.task,
             robot=args.robot,
             backend=args.backend,
-            workers=args.workers,
+            workers=chosen_workers(args),
             device=args.device,
             overwrite=args.overwrite,
             progress=progress,

@@ -130,7 +130,7 @@ def digest(parts: Mapping[str, Any]) -> str:
         sha.update(json.dumps(name).encode())
         if isinstance(value, np.ndarray):
             sha.update(f"{value.dtype.str}{value.shape}".encode())
-            sha.update(np.ascontiguousarray(value).tobytes())
+            sha.update(np.ascontiguousarray(value).data)
         else:
             sha.update(json.dumps(value, sort_keys=True).encode())
     return sha.hexdigest()

@@ -31,8 +31,9 @@ CPU_SECONDS = 2.0
 MEMORY_BYTES = 256 * 2**20
 # What one file may hold when it is unpacked.
 MAX_UNPACKED_BYTES = 8 * 2**30
-# LZF writes at least 3 bytes for 264.
-_LZF_RATIO = 88
+# How images are packed: level 1 of DEFLATE, whose most for a bit is half of 258 bytes.
+DEFLATE_LEVEL = 1
+_DEFLATE_RATIO = 1032
 _MAX_NAMES = 1000
 
 
@@ -169,17 +170,18 @@ def _check_frames(
     if layout.get_layout() != h5py.h5d.CHUNKED or layout.get_chunk() != (1, *shape[1:]):
         raise ValueError(f"{at}: expected images one by one, in this file")
     frame = unpacked // shape[0] if shape[0] else 0
-    filters = [layout.get_filter(i) for i in range(layout.get_nfilters())]
-    codes = [code for code, *_ in filters]
-    if codes != [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_LZF] or filters[1][2][2:] != (frame,):
-        raise ValueError(f"{at}: expected the filters shuffle and LZF, got {codes}")
+    filters = [layout.get_filter(i)[::2] for i in range(layout.get_nfilters())]
+    size = leaf.get_type().get_size()
+    wanted = [(h5py.h5z.FILTER_SHUFFLE, (size,))] if size > 1 else []
+    wanted += [(h5py.h5z.FILTER_DEFLATE, (DEFLATE_LEVEL,))]
+    if filters != wanted:
+        raise ValueError(f"{at}: expected the filters {wanted}, got {filters}")
     chunks: list[tuple[int, int]] = []
     leaf.chunk_iter(lambda chunk: chunks.append((chunk.filter_mask, chunk.size)))
     if len(chunks) != shape[0]:
         raise ValueError(f"{at}: declares {shape[0]} images, has {len(chunks)}")
     for mask, size in chunks:
-        # LZF is left out (2) where it would gain nothing.
-        if mask not in (0, 2) or (size != frame if mask else frame > _LZF_RATIO * size):
+        if mask or frame > _DEFLATE_RATIO * size:
             raise ValueError(f"{at}: an image of {frame} bytes is stored in {size}")
     return sum(size for _, size in chunks)
 

@@ -34,7 +34,7 @@ from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.appearance import randomise_appearance
 from sart_toolkit.tasks.task import Placement, Task
-from sart_toolkit.workers import worker_map
+from sart_toolkit.workers import Workers, worker_map
 
 _OVERVIEW, _VIDEO_SIZE = "overview", 384
 _log = logging.getLogger(__name__)
@@ -227,7 +227,7 @@ def evaluate_skill(
     make_backend: BackendFactory,
     config: EvaluateConfig | None = None,
     out: Path | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     device: str = "cpu",
     progress: Callable[[int, int, int], None] | None = None,
     film: Film | None = None,
@@ -245,7 +245,7 @@ def evaluate_skill(
         make_backend: makes the robot in the task's scene; picklable if `workers` > 1.
         config: how many rollouts, from which seed.
         out: where `evaluation.json` is written, `videos/` beside it; `None` writes nothing.
-        workers: processes.
+        workers: how many processes, or `Workers` elsewhere.
         device: where the policy runs.
         progress: called with (done, wanted, successes) after each rollout.
         film: makes the videos, such as `report.video.film_rollout`.
@@ -264,8 +264,7 @@ def evaluate_skill(
             f"videos: expected 0 without `film` and `out`, got {config.videos}; pass "
             "film=sart_toolkit.film_rollout and where to write"
         )
-    if workers < 1:
-        raise InvalidInput(f"workers: expected at least 1, got {workers}")
+    workers = Workers.of(workers)
     if out is not None:
         check_writable(out, overwrite)
     make_worker = functools.partial(_Worker, skill_directory, task, make_backend, config, device)
@@ -276,8 +275,9 @@ def evaluate_skill(
             request = _request(skill_directory, task, worker, config)
             log = stack.enter_context(ResultLog(out, request, overwrite))
         run: Callable[[Iterable[int]], Iterator[Rollout]] = functools.partial(map, worker)
-        if workers > 1:
-            run = stack.enter_context(worker_map(make_worker, workers))
+        if not workers.here:
+            gpu = device != "cpu"
+            run = stack.enter_context(worker_map(make_worker, workers, gpu))
         rows = _rows(run, task, config, log, progress)
         result = _summary(rows, worker, task, config)
         if out is not None and log is not None:

@@ -33,6 +33,7 @@ from sart_toolkit.learn.samples import WindowConfig, Windows, open_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.poses import check_positive
 from sart_toolkit.registry import lasting_reference
+from sart_toolkit.userfiles import local_file
 
 CHECKPOINT = "checkpoint.safetensors"
 _CHECKPOINT_SECONDS = 30.0
@@ -144,6 +145,10 @@ class TrainConfig:
     def to_json(self) -> dict[str, Any]:
         """The configuration as JSON values."""
         return {**dataclasses.asdict(self), "cameras": list(self.cameras)}
+
+    def files_needed(self) -> list[Path]:
+        """The backbone's weights, if there are any."""
+        return [] if self.backbone_weights is None else [Path(self.backbone_weights)]
 
 
 @dataclass(frozen=True)
@@ -323,7 +328,7 @@ class _Training:
         self.policy = build_policy(config, windows.frames.layout.sizes)
         self.policy.set_normalisation(windows.normalisation())
         if config.backbone_weights is not None and not resumes:
-            self.policy.load_backbone(Path(config.backbone_weights))
+            self.policy.load_backbone(local_file(config.backbone_weights))
         self.policy.to(device)
         self.optimizer = make_optimizer(self.policy, config)
         self.windows = windows.to(device) if _has_room(device, windows) else windows

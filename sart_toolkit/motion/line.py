@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 
 from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.errors import MotionRejected
 from sart_toolkit.motion.path import SplinePath
 from sart_toolkit.motion.timing import Motion, timed
-from sart_toolkit.poses import Array, check_pose, check_positive, distance, interpolate
+from sart_toolkit.poses import Array, StraightLine, check_pose, check_positive, distance
 from sart_toolkit.robots.model import RobotModel
 
 # The number of knots is doubled until the tool's deviation is within bounds.
@@ -50,7 +48,7 @@ def straight_line(
     start, end = check_pose("T_world_start", T_world_start), check_pose("T_world_end", T_world_end)
     check_positive("duration", duration, "s")
     check_positive("deviation", deviation, "m")
-    T_at = functools.partial(interpolate, start, end)
+    T_at = StraightLine(start, end)
     count = _FEWEST
     try:
         knots = _solutions(model, q_start, T_at, np.linspace(0.0, 1.0, count), max_joint_step)
@@ -87,7 +85,7 @@ def straight_line(
 
 
 def _solutions(
-    model: RobotModel, q_start: Array, T_at: functools.partial[Array], grid: Array, max_step: float
+    model: RobotModel, q_start: Array, T_at: StraightLine, grid: Array, max_step: float
 ) -> Array:
     """Joint configurations `(m, n)` at path parameters `(m,)`, on the branch of `q_start`."""
     knots = np.empty((len(grid), len(q_start)))

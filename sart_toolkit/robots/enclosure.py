@@ -8,7 +8,7 @@ and a part takes in the corners that it lacks, or another part is added where th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,19 +134,6 @@ class ShapePart:
 Part = HullPart | ShapePart
 
 
-@dataclass
-class Enclosure:
-    """Parts of one link: first those of its collision elements, then what had to be added.
-
-    Attributes:
-        parts: the parts.
-        owner: for each triangle that was given, the index of a part which encloses it.
-    """
-
-    parts: list[Part]
-    owner: Faces = field(default_factory=lambda: np.zeros(0, np.intp))
-
-
 def standing_out(parts: Sequence[Part], vertices: Array, faces: Faces) -> Array:
     """How far `(n,)` [m] each triangle stands out of the part that encloses it best.
 
@@ -170,7 +157,7 @@ def shape_stands_out(parts: Sequence[Part], shape: Shape) -> bool:
     return all(part.outside(centre).max() > _SLACK - radius for part in parts)
 
 
-def enclose(parts: Sequence[Part], vertices: Array, faces: Faces) -> Enclosure:
+def enclose(parts: Sequence[Part], vertices: Array, faces: Faces) -> list[Part]:
     """Parts grown, and joined by others, until each triangle is inside one of them.
 
     Args:
@@ -204,7 +191,7 @@ def enclose(parts: Sequence[Part], vertices: Array, faces: Faces) -> Enclosure:
             made.append(new)
             added += 1
     _take_in(made, vertices, loose, np.inf)
-    return Enclosure(made, _owners(made, vertices, faces))
+    return made
 
 
 def _take_in(parts: list[Part], vertices: Array, faces: Faces, within: float) -> Faces:
@@ -223,18 +210,6 @@ def _take_in(parts: list[Part], vertices: Array, faces: Faces, within: float) ->
         if len(taken):
             parts[i] = part.grown(vertices[np.unique(taken)])
     return loose[~near]
-
-
-def _owners(parts: Sequence[Part], vertices: Array, faces: Faces) -> Faces:
-    """For each triangle the part, among those that enclose it, that encloses most of all."""
-    if len(parts) == 1:
-        return np.zeros(len(faces), np.intp)
-    outs = _outs(parts, vertices, faces)
-    inside = outs <= _SLACK
-    owner: Faces = outs.argmin(axis=0)
-    for i in inside.sum(axis=1).argsort():
-        owner[inside[i]] = i
-    return owner
 
 
 def _outs(parts: Sequence[Part], vertices: Array, faces: Faces) -> Array:

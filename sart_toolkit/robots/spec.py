@@ -13,6 +13,7 @@ import numpy as np
 from sart_toolkit.data.assets import asset
 from sart_toolkit.errors import InvalidInput, MissingExtra, MissingFile
 from sart_toolkit.poses import Array, check_array, check_pose, check_positive, frozen
+from sart_toolkit.userfiles import local_file
 
 _SIDES = 16
 
@@ -266,6 +267,17 @@ class RobotSpec:
         if len(set(names)) < len(names):
             raise InvalidInput(f"cameras of {self.name}: expected different names, got {names}")
 
+    def files_needed(self) -> list[Path]:
+        """The URDFs that are named by a path, and the meshes that they name.
+
+        Raises:
+            MissingFile, BrokenFile: a URDF can't be read.
+        """
+        from sart_toolkit.robots.urdf import source_files
+
+        named = [urdf for urdf in (self.urdf, self.gripper.urdf) if ":" not in urdf]
+        return [file for urdf in named for file in source_files(resource_path(urdf))]
+
 
 def resource_path(resource: str) -> Path:
     """The file that `package:path/inside/it` or a plain path names; `sart_toolkit:` is `assets/`.
@@ -286,7 +298,7 @@ def resource_path(resource: str) -> Path:
             raise MissingExtra(f"{resource}: package {package!r} missing; pip install {package}")
         path = Path(found.origin).parent / inside
     else:
-        path = Path(resource)
+        path = local_file(resource)
     if not path.is_file():
         raise MissingFile(f"{resource}: no such file ({path.name}); check the robot's urdf entries")
     return path

@@ -1,8 +1,8 @@
-"""One URDF from an arm, a gripper and what is fixed to them, with light meshes, made once.
+"""One URDF from an arm, a gripper and what is fixed to them, made once.
 
-Visual meshes are simplified, collision shapes become convex parts that enclose all of the link,
-what is drawn and what collides, and names get a prefix, so that any simulator and Pinocchio read
-the same small file.
+Visual meshes get normals, collision shapes become convex parts that enclose all of the link, what
+is drawn and what collides, and names get a prefix, so that any simulator and Pinocchio read the
+same file.
 """
 
 from __future__ import annotations
@@ -23,16 +23,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import fast_simplification
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, SartError, unknown_name
 from sart_toolkit.poses import Array, inverse, rpy_pose
 from sart_toolkit.robots.enclosure import (
     TOLERANCE,
-    Enclosure,
     Faces,
     HullPart,
     Part,
@@ -51,10 +48,11 @@ from sart_toolkit.robots.spec import (
 )
 
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 12
-# What simplifies and hulls: another version may make other meshes.
-_MADE_WITH = ("trimesh", "fast-simplification", "scipy", "numpy")
-_ARM_FACES, _GRIPPER_FACES = 150, 300
+_RECIPE = 13
+# What shades and hulls: another version may make other meshes.
+_MADE_WITH = ("trimesh", "scipy", "numpy")
+# Faces that meet at a sharper angle show an edge.
+_CREASE_DEG = 30.0
 _GRIPPER_PREFIX = "gripper_"
 _MANIFEST = "manifest.json"
 _MESH_TYPES = (".dae", ".glb", ".obj", ".off", ".ply", ".stl")
@@ -115,7 +113,6 @@ def _key(spec: RobotSpec, attachments: Sequence[Attachment], sources: Sequence[P
         files.append([source.name, digest, meshes])
     made_from = {
         "recipe": _RECIPE,
-        "faces": (_ARM_FACES, _GRIPPER_FACES),
         "versions": _versions(),
         "sources": files,
         # Cameras are no part of a URDF: one that is moved a little needs no new one.
@@ -157,6 +154,17 @@ def _digest(path: Path) -> str:
 def _mesh_names(source: Path, digest: str) -> tuple[str, ...]:
     """The mesh files that a URDF of that content names."""
     return tuple(sorted({mesh.get("filename", "") for mesh in parsed(source).iter("mesh")}))
+
+
+def source_files(source: Path) -> list[Path]:
+    """A URDF and the existing mesh files that it names.
+
+    Raises:
+        BrokenFile: the URDF can't be read.
+    """
+    names = _mesh_names(source, _digest(source))
+    meshes = [_mesh_path(name, source.parent) for name in names]
+    return [source, *(path for path in meshes if path.is_file())]
 
 
 def _intact(directory: Path) -> bool:
@@ -221,7 +229,7 @@ def _compose(
         for element in _elements(source, prefix):
             robot.append(element)
             if element.tag == "link":
-                _lighten(element, source.parent, work, f"{len(robot):03d}", spec)
+                _prepare(element, source.parent, work, f"{len(robot):03d}", spec)
     for parent, child, T in (
         (spec.gripper.parent_frame, spec.gripper_base, spec.gripper.T_parent_gripper),
         (spec.gripper_base, spec.tool_frame, spec.T_gripper_tool),
@@ -328,8 +336,8 @@ def _elements(source: Path, prefix: str) -> list[ET.Element]:
     return kept
 
 
-def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotSpec) -> None:
-    """Give the link convex parts that enclose it for collisions, and simplified visual meshes.
+def _prepare(link: ET.Element, base: Path, work: Path, number: str, spec: RobotSpec) -> None:
+    """Give the link convex parts that enclose it for collisions, and visual meshes with normals.
 
     Raises:
         BrokenFile: a mesh is missing or can't be read.
@@ -337,16 +345,14 @@ def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
     """
     name = link.get("name", "")
     colour = spec.link_colours.get(name, (0.6, 0.6, 0.62, 1.0))
-    # The wrist camera sees the gripper close by and the arm never.
-    target = _GRIPPER_FACES if name.startswith(_GRIPPER_PREFIX) else _ARM_FACES
     paths = [_mesh_path(mesh.get("filename", ""), base) for mesh in link.iter("mesh")]
     digests = tuple(_digest(path) if os.path.isfile(path) else "" for path in paths)
-    key = ET.tostring(link, encoding="unicode"), digests, target
-    if key not in _made_light:
-        if len(_made_light) >= _MOST_LINKS:
-            _made_light.clear()
-        _made_light[key] = _lightened(key[0], base, target)
-    text, files = _made_light[key]
+    key = ET.tostring(link, encoding="unicode"), digests
+    if key not in _prepared:
+        if len(_prepared) >= _MOST_LINKS:
+            _prepared.clear()
+        _prepared[key] = _prepared_link(key[0], base)
+    text, files = _prepared[key]
     made = ET.fromstring(text)
     link[:] = list(made)
     # Names that no two links share, and that are safe for any file system.
@@ -360,26 +366,25 @@ def _lighten(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
 
 
 # Links are remembered by all that they are made from, since robots share them.
-_made_light: dict[tuple[str, tuple[str, ...], int], tuple[str, dict[str, bytes]]] = {}
+_prepared: dict[tuple[str, tuple[str, ...]], tuple[str, dict[str, bytes]]] = {}
 _MOST_LINKS = 256
 
 
-def _lightened(text: str, base: Path, target: int) -> tuple[str, dict[str, bytes]]:
-    """A link's element with light meshes, as text, and these meshes' files.
+def _prepared_link(text: str, base: Path) -> tuple[str, dict[str, bytes]]:
+    """A link's element with meshes of our own, as text, and these meshes' files.
 
     Args:
         text: the link's element, checked.
         base: where its meshes' paths start.
-        target: about how many faces each visual mesh gets.
     """
     link = ET.fromstring(text)
     with tempfile.TemporaryDirectory(prefix="sart-link-") as folder:
-        _make_light(link, base, Path(folder), target)
+        _prepare_meshes(link, base, Path(folder))
         files = {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
     return ET.tostring(link, encoding="unicode"), files
 
 
-def _make_light(link: ET.Element, base: Path, work: Path, target: int) -> None:
+def _prepare_meshes(link: ET.Element, base: Path, work: Path) -> None:
     name = link.get("name", "")
     visuals, collisions = link.findall("visual"), link.findall("collision")
     if visuals and not collisions:
@@ -391,27 +396,19 @@ def _make_light(link: ET.Element, base: Path, work: Path, target: int) -> None:
         mesh = element.find("geometry/mesh")
         if mesh is not None:
             _check_mesh(_loaded(mesh, base), name, element.tag, mesh.get("filename", ""))
-    source = drawn_triangles(link, base)
-    solids = _collision_meshes(link, base)
-    made = _enclosed(link, base, *source)
-    _write_parts(link, made.parts, work)
-    start = 0
+    vertices, faces = drawn_triangles(link, base)
+    parts = _enclosed(link, base, vertices, faces)
+    _write_parts(link, parts, work)
     for index, element in enumerate(visuals):
         mesh = element.find("geometry/mesh")
-        if mesh is None:
-            continue
-        loaded = _loaded(mesh, base)
-        owner = made.owner[start : start + len(loaded.faces)]
-        start += len(loaded.faces)
-        light = _light(loaded, owner, made.parts, _place(element), target, solids)
-        _export(light, mesh, work, f"visual_{index}.obj")
-    for vertices, faces in (source, drawn_triangles(link, work)):
-        out = standing_out(link_parts(link, work), vertices, faces)
-        if len(out) and out.max() > TOLERANCE:
-            raise InvalidInput(
-                f"link {name!r}: what is drawn stands {out.max() * 1e3:.3f} mm out of its "
-                f"collision parts, expected at most {TOLERANCE * 1e3:g} mm; export its meshes again"
-            )
+        if mesh is not None:
+            _export(creased(_loaded(mesh, base)), mesh, work, f"visual_{index}.obj", normals=True)
+    out = standing_out(link_parts(link, work), vertices, faces)
+    if len(out) and out.max() > TOLERANCE:
+        raise InvalidInput(
+            f"link {name!r}: what is drawn stands {out.max() * 1e3:.3f} mm out of its "
+            f"collision parts, expected at most {TOLERANCE * 1e3:g} mm; export its meshes again"
+        )
 
 
 def link_parts(link: ET.Element, folder: Path) -> list[Part]:
@@ -453,18 +450,41 @@ def drawn_shapes(link: ET.Element) -> list[Shape]:
     return [_shape(v) for v in link.findall("visual") if v.find("geometry/mesh") is None]
 
 
-def _enclosed(link: ET.Element, base: Path, vertices: Array, faces: Faces) -> Enclosure:
+def drawn_elements(
+    link: ET.Element, folder: Path
+) -> list[tuple[Shape | trimesh.Trimesh, Array, tuple[float, float, float, float]]]:
+    """What is drawn of a composed URDF's link, where, and in which colour.
+
+    Shapes are in the link's frame; meshes, whose pose `(4, 4)` in it comes second, in their own.
+    """
+    found: list[tuple[Shape | trimesh.Trimesh, Array, tuple[float, float, float, float]]] = []
+    for visual in link.findall("visual"):
+        red, green, blue, alpha = _floats(_found(visual, "material/color").get("rgba", ""))
+        mesh = visual.find("geometry/mesh")
+        what: Shape | trimesh.Trimesh
+        if mesh is None:
+            what = dataclasses.replace(_shape(visual), rgba=(red, green, blue, alpha))
+        else:
+            path = folder / mesh.get("filename", "")
+            loaded = trimesh.load(path, force="mesh", process=False)
+            assert isinstance(loaded, trimesh.Trimesh)
+            what = loaded
+        found.append((what, _place(visual), (red, green, blue, alpha)))
+    return found
+
+
+def _enclosed(link: ET.Element, base: Path, vertices: Array, faces: Faces) -> list[Part]:
     """The link's collision parts, grown and joined by others so that all that is drawn is inside.
 
     A primitive that stands out becomes a part itself.
     """
     parts = link_parts(link, base)
     if not parts:
-        return Enclosure([])
+        return []
     made = enclose(parts, vertices, faces)
     for shape in drawn_shapes(link):
-        if shape_stands_out(made.parts, shape):
-            made.parts.append(ShapePart(shape))
+        if shape_stands_out(made, shape):
+            made.append(ShapePart(shape))
     return made
 
 
@@ -485,47 +505,15 @@ def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path) -> None:
             element.append(_geometry(part.shape))
 
 
-def _light(
-    mesh: trimesh.Trimesh,
-    owner: Faces,
-    parts: Sequence[Part],
-    T_link_mesh: Array,
-    target: int,
-    solids: dict[str, trimesh.Trimesh],
-) -> trimesh.Trimesh:
-    """A mesh of about `target` faces that looks like `mesh` and lies in the parts.
-
-    Triangles are simplified part by part, `owner (n,)` says which part's they are: none then
-    reaches from one part to another, and corners that stand out of a part are moved into it.
-    """
-    T_mesh_link = inverse(T_link_mesh)
-    owners = np.unique(owner)
-    pieces = []
-    for i in owners:
-        own = owner == i
-        piece = mesh if len(owners) == 1 else _part_of(mesh, own)
-        solid = solids.get(_key_of(T_link_mesh)) if len(owners) == 1 else None
-        light = _simplified(piece, max(16, round(target * own.mean())), solid)
-        corners = parts[i].confined(_moved(light.vertices, T_link_mesh))
-        pieces.append(trimesh.Trimesh(_moved(corners, T_mesh_link), light.faces, process=False))
-    if len(pieces) == 1:
-        return pieces[0]
-    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
-    return trimesh.Trimesh(
-        np.concatenate([piece.vertices for piece in pieces]),
-        np.concatenate([p.faces + start for p, start in zip(pieces, starts, strict=False)]),
-        process=False,
-    )
+def creased(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with normals at its corners: smooth, but for edges where faces meet sharply."""
+    return trimesh.graph.smooth_shade(mesh, angle=np.deg2rad(_CREASE_DEG), facet_minarea=None)
 
 
-def _part_of(mesh: trimesh.Trimesh, chosen: NDArray[np.bool_]) -> trimesh.Trimesh:
-    """Some triangles of a mesh, without the corners of others."""
-    used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
-    return trimesh.Trimesh(mesh.vertices[used], faces.reshape(-1, 3), process=False)
-
-
-def _export(mesh: trimesh.Trimesh, element: ET.Element, work: Path, file: str) -> None:
-    mesh.export(work / file, include_normals=False, include_texture=False, digits=9)
+def _export(
+    mesh: trimesh.Trimesh, element: ET.Element, work: Path, file: str, normals: bool = False
+) -> None:
+    mesh.export(work / file, include_normals=normals, include_texture=False, digits=9)
     element.set("filename", file)
     element.attrib.pop("scale", None)
 
@@ -556,19 +544,6 @@ def _shape(element: ET.Element) -> Shape:
     if shape.tag == "sphere":
         return Shape("sphere", (radius,), T)
     return Shape("cylinder", (radius, float(shape.get("length", ""))), T)
-
-
-def _key_of(T: Array) -> str:
-    return str(np.round(T, 9).tolist())
-
-
-def _collision_meshes(link: ET.Element, base: Path) -> dict[str, trimesh.Trimesh]:
-    """The link's collision meshes by their place, to draw where a visual mesh stays heavy."""
-    return {
-        _key_of(_place(element)): _loaded(mesh, base)
-        for element in link.findall("collision")
-        if (mesh := element.find("geometry/mesh")) is not None
-    }
 
 
 def _mesh_path(name: str, base: Path) -> Path:
@@ -633,44 +608,6 @@ def _check_mesh(mesh: trimesh.Trimesh, link: str, kind: str, file: str) -> None:
             f"{what} reaches {np.abs(mesh.vertices).max():.4g} m from its origin, expected at most "
             f"{_MAX_EXTENT:g} m; give it a scale"
         )
-
-
-def _simplified(
-    mesh: trimesh.Trimesh, target: int, solid: trimesh.Trimesh | None
-) -> trimesh.Trimesh:
-    """A mesh of about `target` faces that looks like `mesh`.
-
-    Meshes that fall into many pieces don't simplify well; then the closed `solid` is used, or
-    corners closer than a millimetre are joined first.
-    """
-    made: list[trimesh.Trimesh] = []
-    for candidate in (lambda: mesh, lambda: solid, lambda: _joined(mesh)):
-        source = candidate()
-        if source is None:
-            continue
-        made.append(_decimated(source, target))
-        if len(made[-1].faces) <= 2 * target:
-            return made[-1]
-    return min(made, key=lambda m: len(m.faces))
-
-
-def _joined(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with corners closer than a millimetre joined."""
-    joined = mesh.copy()
-    joined.merge_vertices(digits_vertex=3)
-    joined.update_faces(joined.nondegenerate_faces())
-    return joined
-
-
-def _decimated(mesh: trimesh.Trimesh, target: int) -> trimesh.Trimesh:
-    if len(mesh.faces) <= target:
-        return mesh
-    vertices, faces = fast_simplification.simplify(
-        np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), target_count=target
-    )
-    # Where faces meet at a sharp angle the simplified corner may shoot far out.
-    vertices = np.clip(vertices, *mesh.bounds)
-    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def _origin(T: Array) -> ET.Element:

@@ -143,11 +143,14 @@ class Light:
     """A distant light: `direction (3,)` from the scene towards it, world frame.
 
     `intensity`: what a face turned to it reflects of its colour; `ambient`: what any face does.
+    `shadows`: whether bodies keep it from what is behind them. An arm's shadow in the wrist
+    camera's images tells where the robot stands, which a policy learns instead of the task.
     """
 
     direction: Array = field(default_factory=lambda: np.array([0.3, 0.4, 1.0]))
     intensity: float = 0.35
     ambient: float = 0.6
+    shadows: bool = False
 
     def __post_init__(self) -> None:
         direction = check_array("direction of the light", self.direction, (3,))

@@ -4,7 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sart_toolkit.augment.allocation import allocate
+from sart_toolkit.augment.allocation import Allocation, allocate
+from sart_toolkit.augment.config import AugmentConfig
+from sart_toolkit.augment.strategies import SphereStrategy
 
 radii = st.lists(st.floats(1e-3, 0.3), min_size=1, max_size=12)
 numbers = st.integers(0, 300)
@@ -62,3 +64,31 @@ def test_a_wide_sphere_gets_most():
 
 def test_without_spheres_nothing_is_given():
     assert allocate(5, np.ones(0)) == []
+
+
+class _OnlyTheLast(SphereStrategy):
+    """A strategy that shares N in a way of its own."""
+
+    def weights(self, spheres, allocation):
+        return np.arange(len(spheres)) == len(spheres) - 1
+
+
+ONLY_THE_LAST = _OnlyTheLast()
+
+
+def test_a_strategy_decides_how_trajectories_are_shared(peg_demonstration, peg_annotation):
+    config = AugmentConfig(n=9, strategy=ONLY_THE_LAST)
+    shares = Allocation([(peg_demonstration, peg_annotation)], config).shares
+    assert [share.wanted for share in shares] == [0] * (len(shares) - 1) + [8]
+
+
+def test_every_waypoint_of_miles_is_given_as_many_and_few_are_spread(peg_demonstration):
+    n = len(peg_demonstration) - 1
+    for each in (1, 3):
+        config = AugmentConfig(n=1 + each * n, strategy="miles")
+        shares = Allocation([(peg_demonstration, None)], config).shares
+        assert [share.waypoint for share in shares] == list(range(n))
+        assert {share.wanted for share in shares} == {each}
+    few = Allocation([(peg_demonstration, None)], AugmentConfig(n=13, strategy="miles")).shares
+    chosen = [share.waypoint for share in few if share.wanted]
+    assert len(chosen) == 12 and max(np.diff([-1, *chosen, n])) <= n / 3

@@ -15,7 +15,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from sart_toolkit.augment import STRATEGIES, engine, get_strategy
+from sart_toolkit.augment import STRATEGIES, allocation, engine, get_strategy
 from sart_toolkit.augment.allocation import allocate
 from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration, augment_sources
@@ -344,8 +344,8 @@ def test_what_a_sphere_cannot_give_is_asked_of_the_others_and_said_with_the_reas
 def test_what_no_sphere_can_give_leaves_fewer_trajectories_and_a_warning(
     annotate, augment, tmp_path, caplog, monkeypatch
 ):
-    monkeypatch.setattr(engine, "_LEAST_ATTEMPTS", 3)
-    monkeypatch.setattr(engine, "_ATTEMPTS_PER_EPISODE", 1)
+    monkeypatch.setattr(allocation, "_LEAST_ATTEMPTS", 3)
+    monkeypatch.setattr(allocation, "_ATTEMPTS_PER_EPISODE", 1)
     spheres = annotate((0, 0.01), (34, 1.5))
     with caplog.at_level(logging.WARNING):
         dataset = augment(
@@ -895,7 +895,7 @@ def test_an_executor_may_choose_its_order_and_changes_nothing_by_it(
     augment, crowded, crowded_dataset, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(engine, "get_executor", lambda *_: Backwards)
-    with pytest.raises(InvalidInput, match="workers: executor 'auto' needs 1 process, got 2"):
+    with pytest.raises(InvalidInput, match="workers: execution 'auto' needs 1 process, got 2"):
         augment(crowded, tmp_path / "d", workers=2)
     assert augment(crowded, tmp_path / "d").content_hash == crowded_dataset.content_hash
 

@@ -20,8 +20,8 @@ from sart_toolkit.errors import CannotWrite, InvalidInput, MissingCapability, Sa
 from sart_toolkit.poses import distance, interpolate, pose
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, look_at
-from sart_toolkit.scenes.spec import Body, Detent, Joint, Light, SceneSpec
+from sart_toolkit.robots.spec import Attachment, Shape
+from sart_toolkit.scenes.spec import Body, Detent, Joint, SceneSpec
 from sart_toolkit.workers import worker_map
 
 pytest.importorskip("sapien")
@@ -406,36 +406,6 @@ def test_contacts_name_held_bodies_and_links_that_are_fixed_to_others():
 
 
 # --- images -----------------------------------------------------------------------------------
-
-
-def _looking_down(*bodies: Body, light: Light) -> SapienBackend:
-    eye, up = np.array([-1.5, 0, 1.5]), np.array([0, 1.0, 0])
-    camera = CameraSpec("above", "world", look_at(eye, np.array([-1.5, 0, 0]), up), 40.0)
-    scene = SceneSpec(bodies, cameras=(camera,), light=light)
-    backend = SapienBackend(get_robot("ur5e_hande"), scene, 64)
-    backend.reset(scene.initial_state(backend.robot.home, 0.0))
-    return backend
-
-
-@pytest.fixture
-def draws():
-    reason = sapien_renderer.why_no_images()
-    if reason:
-        pytest.skip(f"SAPIEN can't draw here: {reason}")
-
-
-def test_a_face_shows_its_colour_as_the_light_has_it_and_less_in_shadow(draws):
-    colour = np.array([0.2, 0.5, 0.8])
-    light = Light(np.array([1.0, 0, 1]), intensity=0.5, ambient=0.4)
-    floor = Body("floor", (Shape("box", (2, 2, 0.1), pose([-1.5, 0, -0.05]), (*colour, 1)),))
-    post = Body("post", (Shape("box", (0.1, 0.1, 0.2), pose([-1.5, 0, 0.4])),))
-    backend = _looking_down(floor, post, light=light)
-    rgb = backend.observe(("above",)).cameras["above"].rgb
-    # The post's shadow falls 0.3 to 0.5 m towards -x, which is left in the image.
-    lit = 255 * colour * (0.4 + 0.5 * np.cos(np.pi / 4))
-    np.testing.assert_allclose(rgb[32, 60], lit, atol=1)
-    np.testing.assert_allclose(rgb[32, 9], 255 * colour * 0.4, atol=1)
-    backend.close()
 
 
 _WITHOUT_DRIVER = """

@@ -18,7 +18,7 @@ from sart_toolkit.backends import BACKENDS
 from sart_toolkit.cli import main
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import Demonstration
-from sart_toolkit.data.storage import load_demonstration
+from sart_toolkit.data.storage import load_demonstration, read_json_lines
 from sart_toolkit.doctor import Finding
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.appearance import Appearance, AppearanceConfig
@@ -113,6 +113,49 @@ def test_same_seed_gives_the_same_bytes(
     assert other != before
 
 
+def test_a_dry_run_writes_what_would_be_executed(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = tmp_path / "plan.jsonl"
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--n", 5, "--dry-run"]
+    result = run(capsys, *argv, "--out", plan)
+    assert result["wanted"] == result["proved"] == 4 and result["plan"] == str(plan)
+    proved = [row for row in read_json_lines(plan)[1:] if row["outcome"] == "proved"]
+    index = load_dataset(chain / "data").index
+    assert [row["certificate"]["clearance"] for row in proved] == [e.clearance for e in index]
+    assert "already exists" in error(capsys, *argv, "--out", plan)
+
+
+def test_datasets_merge_split_and_are_trained_on(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--n", 4, "--seed", 1]
+    run(capsys, *argv, "--out", tmp_path / "other")
+    merged = run(capsys, "merge", chain / "data", tmp_path / "other", "--out", tmp_path / "both")
+    assert (merged["n_kept"], merged["n_trajectories"]) == (7, 8)
+    assert run(capsys, "validate", tmp_path / "both")["episodes"] == 7
+    words = ["split", tmp_path / "both", "--out", tmp_path / "parts"]
+    parts = run(capsys, *words, "--parts", "train=0.7,validation=0.3")
+    train, validation = tmp_path / "parts" / "train", tmp_path / "parts" / "validation"
+    assert {name: part["n_kept"] for name, part in parts.items()} == {
+        str(train): 5, str(validation): 2,
+    }  # fmt: skip
+    learned = run(
+        capsys, "train", train, "--out", tmp_path / "skill", "--epochs", 1, "--image-size", 32
+    )
+    assert learned["trajectories"] == 6
+    short = run(capsys, *words[:2], "--out", tmp_path / "short", "--n", 3)
+    assert short[str(tmp_path / "short")]["n_trajectories"] == 3
+    assert len(run(capsys, *words[:2], "--out", tmp_path / "each", "--by-source")) == 2
+    for wrong, message in (
+        ([], "expected one of parts, n and by_source; give just one"),
+        (["--n", 3, "--by-source"], "give just one"),
+        (["--parts", "a=0.5,b"], "such as train=0.8,validation=0.2, got 'b'"),
+        (["--parts", "a=0.5,a=0.1"], "a name is there twice"),
+    ):
+        assert message in error(capsys, *words, *wrong)
+
+
 def test_info_tells_each_kind_of_file(chain: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kinds = {
         "demo.h5": "demonstration",
@@ -171,7 +214,7 @@ def test_validate_proves_a_dataset_again_and_names_what_does_not_hold(
     assert f"{episode.name}: " in said and "truncated" in said
     assert "1 of 4 episodes don't hold; generate them again" in said
     (broken / "dataset.json").unlink()
-    assert "generation was interrupted" in error(capsys, "validate", broken)
+    assert "interrupted while it was made" in error(capsys, "validate", broken)
 
 
 def test_validate_executes_trajectories_to_the_goal_if_it_is_asked_to(

@@ -119,6 +119,7 @@ def imported(argv):
         ["annotate", "nowhere.h5", "--text"],
         ["augment", "nowhere.h5", "a.json", "--out", "x", "--strategy", "sert"],
         ["augment", "nowhere.h5", "a.json", "--out", "x"],
+        ["augment", "nowhere.h5", "a.json", "--out", "x", "--dry-run"],
         ["validate", "nowhere"],
         ["train", "nowhere", "--out", "x"],
         ["evaluate", "nowhere", "--out", "x"],

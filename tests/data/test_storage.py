@@ -11,6 +11,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tracemalloc
+import zlib
 from pathlib import Path
 
 import h5py
@@ -211,6 +213,43 @@ def test_a_demonstration_of_any_make_is_read_back(n, seed, cameras, bodies, stat
         loaded = load_demonstration(Path(directory) / "demo.h5")
     assert same(loaded, demonstration)
     assert loaded.content_hash() == demonstration.content_hash()
+
+
+@pytest.mark.parametrize("kind", ["noise", "plain"])
+def test_images_are_readable_one_by_one_by_any_hdf5_library(tmp_path, kind):
+    demonstration = make_demonstration()
+    camera = demonstration.steps.cameras["wrist"]
+    if kind == "plain":
+        camera = dataclasses.replace(
+            camera, rgb=np.full_like(camera.rgb, 7), depth=np.full_like(camera.depth, 0.5)
+        )
+        steps = dataclasses.replace(demonstration.steps, cameras={"wrist": camera})
+        demonstration = dataclasses.replace(demonstration, steps=steps)
+    save_demonstration(tmp_path / "demo.h5", demonstration)
+    # By HDF5's own filters.
+    with h5py.File(tmp_path / "demo.h5", "r") as file:
+        for part in ("rgb", "depth"):
+            stored, expected = file["steps/cameras/wrist"][part], getattr(camera, part)
+            assert stored.chunks == (1, *expected.shape[1:]) and stored.dtype == expected.dtype
+            assert all(np.array_equal(stored[i], image) for i, image in enumerate(expected))
+    assert same(load_demonstration(tmp_path / "demo.h5"), demonstration)
+
+
+@pytest.mark.parametrize(
+    "chunk", [zlib.compress(bytes(10**6)), zlib.compress(bytes(5)), b"no stream at all" * 8]
+)
+def test_an_image_that_unpacks_to_another_size_is_refused_before_it_takes_memory(tmp_path, chunk):
+    save_demonstration(tmp_path / "demo.h5", make_demonstration())
+
+    def exchange(file):
+        file["steps/cameras/wrist/rgb"].id.write_direct_chunk((2, 0, 0, 0), chunk)
+
+    rewritten(tmp_path / "demo.h5", exchange)
+    tracemalloc.start()
+    with pytest.raises(BrokenFile, match="truncated or not a demonstration file"):
+        load_demonstration(tmp_path / "demo.h5")
+    assert tracemalloc.get_traced_memory()[1] < 10**6
+    tracemalloc.stop()
 
 
 def test_states_that_are_nearly_alike_take_hardly_more_room_than_one(tmp_path):

@@ -23,7 +23,7 @@ OWN = {
     "robot": ("04_own_robot.py", "peg_in_hole", ["--robot", "04_own_robot.py:IIWA"], []),
     "task": ("05_own_task.py", "05_own_task.py:Drawer", [], []),
     "strategy": (
-        "06_own_strategy.py", "peg_in_hole", [], ["--strategy", "06_own_strategy.py:INSIDE"],
+        "06_own_strategy.py", "peg_in_hole", [], ["--strategy", "06_own_strategy.py:ABOVE"],
     ),
     "backend": (
         "07_own_backend.py", "peg_in_hole", ["--backend", "07_own_backend.py:Kinematic"], [],

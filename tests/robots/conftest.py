@@ -43,7 +43,7 @@ def model(spec: RobotSpec) -> RobotModel:
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Derived files of this test go here; nothing made before is reused."""
     monkeypatch.setenv("SART_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(urdf, "_made_light", {})
+    monkeypatch.setattr(urdf, "_prepared", {})
     return tmp_path / "cache"
 
 

@@ -1,4 +1,4 @@
-"""Map a worker over items, in this process or in several."""
+"""Workers in processes of this machine."""
 
 from __future__ import annotations
 
@@ -12,28 +12,14 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
-from typing import Any, Protocol, TypeVar
+from contextlib import contextmanager
+from typing import Any
 
-from sart_toolkit.errors import InvalidInput, SartError
-
-Item = TypeVar("Item", contravariant=True)
-Result = TypeVar("Result", covariant=True)
-
-
-class Worker(Protocol[Item, Result]):
-    """Does one item at a time and holds what that takes, a simulator for instance."""
-
-    def __call__(self, item: Item, /) -> Result:
-        """The result of one item."""
-
-    def close(self) -> None:
-        """Free what is held."""
-
+from sart_toolkit.errors import SartError
 
 _worker: Any = None
 # What the pools of threads of numpy, scipy and torch go by when they are loaded.
-_THREAD_COUNTS = (
+THREAD_COUNTS = (
     "MKL_NUM_THREADS",
     "NUMEXPR_NUM_THREADS",
     "OMP_NUM_THREADS",
@@ -81,7 +67,7 @@ def _one_thread_each() -> Iterator[None]:
     They share the cores already. Threads that wait for each other at every step, as OpenMP's do,
     take several times as long where something else uses a core.
     """
-    added = [name for name in _THREAD_COUNTS if name not in os.environ]
+    added = [name for name in THREAD_COUNTS if name not in os.environ]
     os.environ.update(dict.fromkeys(added, "1"))
     try:
         yield
@@ -91,28 +77,14 @@ def _one_thread_each() -> Iterator[None]:
 
 
 @contextmanager
-def worker_map(
-    make_worker: Callable[[], Worker[Item, Result]], processes: int
-) -> Iterator[Callable[[Iterable[Item]], Iterator[Result]]]:
-    """A function that maps items to results in order, as they come.
-
-    Several processes compute with one thread each, and end with this one, however it ends. Left by
-    an error or an interruption, they are ended at once.
-
-    Args:
-        make_worker: makes a worker; picklable if there are several processes.
-        processes: 1 works here; more start as many processes.
+def process_map(
+    make_worker: Callable[[], Any], processes: int
+) -> Iterator[Callable[[Iterable[Any]], Iterator[Any]]]:
+    """A function that maps items to results in order, in several processes; see `worker_map`.
 
     Raises:
-        InvalidInput: `processes` is not positive.
         SartError: a process ended unexpectedly.
     """
-    if processes < 1:
-        raise InvalidInput(f"workers: expected at least 1, got {processes}")
-    if processes == 1:
-        with closing(make_worker()) as worker:
-            yield lambda items: map(worker, items)
-        return
     # A forked copy of a process with threads (torch, HDF5) may hang: start afresh.
     context = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())

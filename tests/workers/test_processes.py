@@ -115,7 +115,7 @@ import ctypes, sys
 from pathlib import Path
 from sart_toolkit.workers import worker_map
 sys.path.insert(0, sys.argv[1])
-from test_workers import Sleeper
+from test_processes import Sleeper
 
 class Unbound(Sleeper):
     def __init__(self):
