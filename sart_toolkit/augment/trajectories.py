@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.execution import SegmentRun
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
+from sart_toolkit.augment.validate import generated_with
 from sart_toolkit.backends.interface import BackendFactory, SavesStates, require
 from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data.dataset import REPLAY, load_dataset
@@ -109,7 +109,8 @@ class _Worker:
 
     def __init__(self, path: Path, task: Task, make_backend: BackendFactory) -> None:
         self._dataset, self._task = load_dataset(path), task
-        self._config = AugmentConfig.from_json(self._dataset.info["config"])
+        # What each source was generated with.
+        self._configs = generated_with(self._dataset)
         self._backend = make_backend()
         try:
             for ability in task.observes:
@@ -132,10 +133,10 @@ class _Worker:
         self._backend.close()
 
     def __call__(self, index: int) -> dict[str, Any]:
-        episode = self._dataset.episode(index)
+        entry, episode = self._dataset.index[index], self._dataset.episode(index)
         row = {
             "index": index,
-            "name": self._dataset.index[index].name,
+            "name": entry.name,
             "success": None,
             "kind": None,
             "reason": None,
@@ -145,8 +146,8 @@ class _Worker:
         }
         merged = episode.provenance.merged
         try:
-            self._go_to_start(episode)
-            row |= self._followed(episode)
+            self._go_to_start(episode, entry.source)
+            row |= self._followed(episode, entry.source)
         except (Unreachable, MotionRejected) as error:
             kind = str(error).partition(":")[0]
             row |= {"success": False if merged else None, "kind": kind, "reason": str(error)}
@@ -154,30 +155,28 @@ class _Worker:
 
     def _planner(self, source: int) -> SegmentPlanner:
         if source not in self._planners:
-            found = self._dataset.sources[source]
-            world = world_of(
-                found.demonstration, self._backend.robot, self._backend.scene, self._config
-            )
-            self._planners[source] = SegmentPlanner(world, found.annotation, self._config, source)
+            found, config = self._dataset.sources[source], self._configs[source]
+            world = world_of(found.demonstration, self._backend.robot, self._backend.scene, config)
+            self._planners[source] = SegmentPlanner(world, found.annotation, config, found.number)
         return self._planners[source]
 
-    def _go_to_start(self, episode: Episode) -> None:
+    def _go_to_start(self, episode: Episode, source: int) -> None:
         """Bring the robot from the restored state of t* to a rest at the sampled pose."""
         p = episode.provenance
-        planner = self._planner(p.source)
+        planner = self._planner(source)
         proposal, rng = planner.proposal(p.sphere, p.k)
         stillness = float(p.certificate["body_stillness"]) if p.certificate else BODY_STILLNESS
         motion, _ = planner.plan(proposal, rng, self._backend.tracking_error, stillness)
         self._restore(planner.world.demonstration.states[p.t_star])
-        run = SegmentRun(self._backend, planner, p.t_star, self._config, stillness)
+        run = SegmentRun(self._backend, planner, p.t_star, self._configs[source], stillness)
         run.settle(planner.approach(p.t_star))
         run.go_out(motion, record=False)
         run.rest(motion)
 
-    def _followed(self, episode: Episode) -> dict[str, Any]:
+    def _followed(self, episode: Episode, source: int) -> dict[str, Any]:
         """What came of a trajectory's actions from its start on."""
         backend, p = self._backend, episode.provenance
-        planner = self._planner(p.source)
+        planner = self._planner(source)
         demonstration, rates = planner.world.demonstration, backend.rates
         suffix = demonstration.steps.measured_Ts_world_tool[episode.suffix(demonstration)]
         recorded = np.concatenate([episode.steps.measured_Ts_world_tool, suffix])

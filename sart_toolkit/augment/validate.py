@@ -82,12 +82,7 @@ def validate_dataset(
     for source in dataset.sources:
         if source.annotation is not None:
             source.annotation.check_matches(source.demonstration)
-    try:
-        configs = [AugmentConfig.from_json(s.request["config"]) for s in dataset.sources]
-    except (KeyError, TypeError) as error:
-        raise BrokenFile(
-            f"{dataset.path / MANIFEST}: {error} is missing or wrong; generate again"
-        ) from error
+    configs = generated_with(dataset)
     check = _EpisodeCheck(robot, scene, dataset, configs)
     problems: dict[str, str] = {}
     for i, entry in enumerate(dataset.index):
@@ -101,6 +96,20 @@ def validate_dataset(
     return Validation(
         len(dataset), problems, least["commanded"], least["measured"], check.largest_deviation
     )
+
+
+def generated_with(dataset: Dataset) -> list[AugmentConfig]:
+    """What each source of a dataset was generated with.
+
+    Raises:
+        BrokenFile: the manifest doesn't say.
+    """
+    try:
+        return [AugmentConfig.from_json(source.request["config"]) for source in dataset.sources]
+    except (KeyError, TypeError) as error:
+        raise BrokenFile(
+            f"{dataset.path / MANIFEST}: {error} is missing or wrong; generate again"
+        ) from error
 
 
 class _EpisodeCheck:

@@ -128,7 +128,7 @@ def test_auto_restores_where_it_can(peg_demonstration, peg_backend, limited):
 
 
 def test_one_robot_has_one_process(made):
-    with pytest.raises(InvalidInput, match="workers: executor 'replay' needs 1 process, got 2"):
+    with pytest.raises(InvalidInput, match="workers: execution 'replay' needs 1 process, got 2"):
         made(workers=2)
 
 
