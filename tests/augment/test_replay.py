@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import logging
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -416,3 +417,20 @@ def test_a_gripper_that_holds_something_is_opened_before_the_scene_is_put_back(
     list(executor.attempts([AttemptKey(0, 0, 0)]))
     assert "Take what the gripper holds" in asked[0] and "Put the scene back" in asked[1]
     assert peg_backend.observe().gripper == pytest.approx(steps.measured_gripper[0], abs=0.01)
+
+
+def test_an_arm_without_any_ability_generates_a_dataset_with_a_person_beside_it(
+    peg_demonstration, peg_annotation, peg_task, peg_model, tmp_path
+):
+    core_only = Path(__file__).parents[1] / "testing" / "core_only.py"
+    make = functools.partial(
+        make_backend, f"{core_only}:CoreOnly", peg_model.spec, peg_task.scene, 48
+    )
+    asked = []
+    dataset = augment_demonstration(
+        peg_demonstration, peg_annotation, make, tmp_path / "d", AugmentConfig(n=7, cameras=()),
+        ask=asked.append,
+    )  # fmt: skip
+    assert len(dataset) == 6 and dataset.info["resets"] == 1
+    assert any("Put the scene back" in text for text in asked)
+    assert not validate_dataset(tmp_path / "d", peg_model.spec, peg_task.scene).problems

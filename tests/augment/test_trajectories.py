@@ -11,6 +11,7 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.trajectories import replay_dataset
 from sart_toolkit.backends.interface import KnowsBodies, Resets, SavesStates
+from sart_toolkit.data.combine import merge_datasets
 from sart_toolkit.data.dataset import REPLAY
 from sart_toolkit.errors import InvalidInput, Mismatch, MissingCapability, OutputExists
 from sart_toolkit.tasks import get_task
@@ -104,6 +105,21 @@ def test_an_interrupted_execution_of_another_task_is_refused(dataset, peg_task, 
     other.name = "another"
     with pytest.raises(Mismatch, match="holds results of"):
         replay_dataset(dataset, other, make_peg_backend)
+
+
+def test_sources_that_were_generated_with_other_settings_are_executed_with_theirs(
+    peg_demonstration, peg_annotation, peg_task, make_peg_backend, peg_dataset, tmp_path
+):
+    config = AugmentConfig(n=3, seed=1, recording="return", cameras=("wrist",))
+    other = augment_demonstration(
+        peg_demonstration, peg_annotation, make_peg_backend, tmp_path / "other", config
+    )
+    alone = replay_dataset(other.path, peg_task, make_peg_backend)
+    merge_datasets([peg_dataset, other], tmp_path / "both")
+    both = replay_dataset(tmp_path / "both", peg_task, make_peg_backend)
+    assert both["n_success"] == 6
+    figures = [{**row, "name": ""} for row in both["trajectories"]]
+    assert all({**row, "name": ""} in figures for row in alone["trajectories"])
 
 
 def test_a_backend_that_cannot_restore_or_judge_is_refused(

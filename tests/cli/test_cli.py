@@ -246,6 +246,22 @@ def test_augment_follows_the_demonstration_if_it_is_asked_to_and_counts_resets(
     )
 
 
+def test_a_person_at_the_terminal_is_told_what_to_do_and_waited_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waited: list[str] = []
+    monkeypatch.setattr("builtins.input", lambda prompt: waited.append(prompt) or "")
+    asked: list[Any] = []
+    monkeypatch.setattr(pipeline, "augment", lambda *_, ask, **__: asked.append(ask))
+    monkeypatch.setattr("sart_toolkit.cli.augment.describe_dataset", lambda _: {})
+    for terminal in (True, False):
+        monkeypatch.setattr(sys.stdin, "isatty", lambda answer=terminal: answer)
+        main(["augment", "demo.h5", "--out", "d"])
+    assert asked[1] is None
+    asked[0]("Put the scene back")
+    assert "Put the scene back" in capsys.readouterr().err and len(waited) == 1
+
+
 def test_radii_are_suggested_from_the_recorded_images_alone(
     chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
