@@ -29,7 +29,7 @@ from sart_toolkit.record.recorder import StepRecorder
 from sart_toolkit.scenes.spec import SceneSpec
 
 # At rest, no joint is faster [rad/s]; how long [s] the robot has for it.
-_REST_SPEED, _LONGEST_REST = 0.01, 2.0
+REST_SPEED, LONGEST_REST = 0.01, 2.0
 # Where only the force is sensed, by how much [N] more than at the start means a contact.
 _MORE_FORCE = 5.0
 # How soon [s] the robot stands still where something stopped it, and is at speed on its way back.
@@ -194,16 +194,16 @@ class SegmentRun:
     def rest(self, motion: Motion) -> None:
         """Stay at the sampled pose until the joints rest, for whole recorded steps."""
         per_record = self._rates.control_per_record
-        for _ in range(round(_LONGEST_REST * self._rates.record_hz)):
+        for _ in range(round(LONGEST_REST * self._rates.record_hz)):
             self._pressed = self._no_force
             for _ in range(per_record):
                 self._send(self._at_end(motion))
                 self._step_end = self._measure()
-            if np.abs(self._step_end.dq).max() <= _REST_SPEED:
+            if np.abs(self._step_end.dq).max() <= REST_SPEED:
                 return
         raise MotionRejected(
             f"no rest at the sampled pose: a joint moves by "
-            f"{np.abs(self._step_end.dq).max():.3f} rad/s after {_LONGEST_REST:g} s"
+            f"{np.abs(self._step_end.dq).max():.3f} rad/s after {LONGEST_REST:g} s"
         )
 
     def _periods(self, targets: Array) -> Array:

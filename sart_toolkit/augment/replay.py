@@ -12,6 +12,8 @@ import numpy as np
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.execution import (
+    LONGEST_REST,
+    REST_SPEED,
     DisturbanceCheck,
     SegmentRun,
     check_untouched,
@@ -35,8 +37,6 @@ from sart_toolkit.scenes.spec import SceneSpec, SceneState
 _log = logging.getLogger(__name__)
 # How often the robot comes to a waypoint before it is given up as one that doesn't reproduce.
 _ARRIVALS = 3
-# At rest, no joint is faster [rad/s]; how long [s] the robot has for it.
-_REST_SPEED, _LONGEST_REST = 0.01, 2.0
 # How far [m] bodies may be from where the demonstration has them; attempts are proved for that.
 _MOST_MOVED = 1e-3
 # The way to the start takes so long [s], or more where the joints need it; nearer than this [rad]
@@ -230,11 +230,8 @@ class ReplayExecutor(SegmentExecutor):
                 planned = self._planned(planned.key, stillness)
             except (Unreachable, MotionRejected) as error:
                 return rejected(planned.key, error), None
-        planner, motion, t = (
-            self.planner(planned.key.source),
-            planned.motion,
-            planned.proposal.t_star,
-        )
+        motion, planner = planned.motion, self.planner(planned.key.source)
+        t = planned.proposal.t_star
         run = SegmentRun(self._backend, planner, t, self._config, planned.stillness)
         back = self._config.recording == "return"
         try:
@@ -347,13 +344,13 @@ class _Follower:
             MotionRejected: the robot doesn't.
         """
         gripper = float(self._demonstration.steps.commanded_gripper[self.t])
-        for _ in range(round(_LONGEST_REST * self._backend.rates.record_hz)):
+        for _ in range(round(LONGEST_REST * self._backend.rates.record_hz)):
             for _ in range(self._backend.rates.control_per_record):
                 self._send(self._controller.hold(), gripper)
-            if self._controller.settled and np.abs(self.seen.dq).max() <= _REST_SPEED:
+            if self._controller.settled and np.abs(self.seen.dq).max() <= REST_SPEED:
                 break
         else:
-            raise MotionRejected(f"no rest at waypoint {self.t}: after {_LONGEST_REST:g} s")
+            raise MotionRejected(f"no rest at waypoint {self.t}: after {LONGEST_REST:g} s")
         self.stopped = True
         # A command that was held back here on the way is the demonstration's own again.
         self._at_waypoint()
