@@ -514,6 +514,7 @@ def augment(
     overwrite: bool = False,
     progress: Progress = _silent,
     sensor: SensorErrors | None = None,
+    ask: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Dataset:
     """Trajectories generated from demonstrations' and annotations' files, in directory `out`.
@@ -529,6 +530,7 @@ def augment(
         progress: called with the trajectories kept.
         sensor: with `obstacles` "cloud", what the images may be off by; if left out, what the
             annotation says, where its spheres were suggested from the images.
+        ask: where the robot can't be reset: shows a person what to do, returns when it is done.
         options: of `AugmentConfig`. Without `n`, a strategy that draws nothing takes the
             demonstrations that there are.
 
@@ -547,6 +549,7 @@ def augment(
     return augment_sources(
         sources, make, out, config, workers, overwrite,
         lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
+        ask,
     )  # fmt: skip
 
 
@@ -732,6 +735,41 @@ def validate(
     return validate_dataset(
         dataset, robot_of(demonstration, robot), task_of(demonstration, task).scene,
         lambda done, wanted: progress("validate", done, wanted),
+    )  # fmt: skip
+
+
+def replay(
+    dataset: Path,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+    workers: int | Workers = 1,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """Whether a dataset's trajectories lead to the goal, also in `replay.json` in its directory.
+
+    Args:
+        dataset: directory from `augment`.
+        task, robot, backend: in place of those that its demonstrations note.
+        workers: how many processes, or `Workers` elsewhere.
+        overwrite: whether an earlier result may be replaced.
+        progress: called with the trajectories done.
+
+    Raises:
+        MissingFile, BrokenFile, MissingCapability, InvalidInput, OutputExists, Mismatch,
+        CannotWrite: as `replay_dataset`.
+        UnknownName: task, robot or backend can't be found.
+    """
+    check_names(task=task, robot=robot, backend=backend)
+    demonstration = load_dataset(dataset).sources[0].demonstration
+    from sart_toolkit.augment.trajectories import replay_dataset
+
+    make = backend_maker(demonstration, 16, demonstration.rates, task, robot, backend)
+    return replay_dataset(
+        dataset, task_of(demonstration, task), make, workers, overwrite,
+        lambda done, wanted, failed: progress("replay", done, wanted, f"{failed} failed"),
     )  # fmt: skip
 
 

@@ -431,6 +431,15 @@ class Augment:
             "where the joints need it."
         ),
     ] = 2.0
+    execution: Annotated[
+        str,
+        arg(
+            metavar="auto|restore|replay|REF",
+            help="How segments are executed: from the demonstration's saved states (restore), or "
+            "on a robot that follows the demonstration to each waypoint (replay); auto: whichever "
+            "backend and demonstration allow.",
+        ),
+    ] = "auto"
     recording: _RECORDING = "reversed"
     source: _SOURCE = "scene"
     sensor: _SENSOR = None
@@ -464,6 +473,11 @@ class Validate:
     """Prove commanded and measured paths of a dataset clear again; check hashes and courses.
 
     Example: sart validate dataset
+
+    Example: sart validate dataset --replay
+
+    With --replay every trajectory is executed to the end of the task besides, commanded at the rate
+    of a policy, and DATASET/replay.json says which reach the goal. That resumes when interrupted.
     """
 
     dataset: Annotated[
@@ -471,6 +485,12 @@ class Validate:
     ]
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
+    backend: _NOTED_BACKEND = None
+    replay: Annotated[bool, arg(help="Also execute every trajectory to the end.")] = False
+    workers: _WORKERS = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
+    overwrite: _OVERWRITE = False
     json: _JSON = False
 
 

@@ -24,6 +24,8 @@ from sart_toolkit.data.storage import (
 from sart_toolkit.errors import BrokenFile, Mismatch, MissingFile
 
 SUMMARY = "dataset.json"
+# What came of executing the trajectories.
+REPLAY = "replay.json"
 MANIFEST = "manifest.jsonl"
 
 

@@ -112,6 +112,7 @@ class DatasetFile(msgspec.Struct):
     robot: Name | UnsetType = UNSET
     seconds: Seconds | None | UnsetType = UNSET
     simulated_seconds: Seconds | None | UnsetType = UNSET
+    resets: Count | None | UnsetType = UNSET
     config: Values | UnsetType = UNSET
     references: References | UnsetType = UNSET
 

@@ -181,7 +181,7 @@ def steps(**changes):
         (stated(tracking_error=0.0003), "commanded path is proved"),
         (stated(tracking_error="none"), "tracking_error: expected a length >= 0 m, got 'none'"),
         (stated(deviation=-0.001), "deviation: expected a length >= 0 m, got -0.001"),
-        (stated(body_stillness=0.0), "proved for bodies that move by other than 0.1 mm"),
+        (stated(body_stillness=0.0), "proved for bodies that move by less than 0.1 mm"),
         (certificate("measured", margin=0.0), "measured path is proved"),
         (certificate("commanded", nonsense=1), "certificate: a field is missing or unknown"),
         (moved_path, r"measured path is (proved|\d+\.\d+ mm off)"),
