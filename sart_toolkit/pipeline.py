@@ -590,13 +590,18 @@ def preview(
     """
     check_writable(out, overwrite)
     sources, config = _asked_for(demo, annotation, task, robot, backend, sensor, options)
+    from sart_toolkit.augment.executors import executor_name
     from sart_toolkit.augment.preview import preview_sources
 
     first = sources[0][0]
+    made = _find(first, "backend", backend, get_backend)
+    # What is proved depends on how it is to be executed.
+    execution = executor_name(
+        config.execution, made, [demonstration for demonstration, _ in sources]
+    )
     return preview_sources(
-        sources, *_setting(first, task, robot),
-        _find(first, "backend", backend, get_backend).tracking_error, out, config, workers,
-        overwrite,
+        sources, *_setting(first, task, robot), made.tracking_error, out,
+        dataclasses.replace(config, execution=execution), workers, overwrite,
         lambda proved, wanted, rejected: progress("plan", proved, wanted, f"{rejected} rejected"),
     )  # fmt: skip
 

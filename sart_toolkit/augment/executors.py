@@ -258,20 +258,29 @@ EXECUTORS = {
 }
 
 
+def executor_name(
+    name: str, backend: type[Backend], demonstrations: Sequence[Demonstration]
+) -> str:
+    """The executor's name that "auto" stands for; any other name stands for itself.
+
+    It is `restore` where the backend saves states and the demonstrations hold some, of whatever
+    backend, else `replay`.
+    """
+    if name != "auto":
+        return name
+    states = all(demonstration.states for demonstration in demonstrations)
+    return "restore" if states and issubclass(backend, SavesStates) else "replay"
+
+
 def get_executor(
     name: str, backend: Backend, demonstrations: Sequence[Demonstration]
 ) -> type[SegmentExecutor]:
-    """The class of executors that a name or reference names.
-
-    "auto" is `restore` where the backend saves states and the demonstrations hold some, of whatever
-    backend, else `replay`.
+    """The class of executors that a name or reference names, see `executor_name` of "auto".
 
     Raises:
         UnknownName: there is none; the message says which part is wrong.
     """
-    if name == "auto":
-        states = all(demonstration.states for demonstration in demonstrations)
-        name = "restore" if states and isinstance(backend, SavesStates) else "replay"
+    name = executor_name(name, type(backend), demonstrations)
     found: type[SegmentExecutor] = expect_class(
         "executor", name, resolve("executor", name, EXECUTORS), SegmentExecutor
     )

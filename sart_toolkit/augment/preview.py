@@ -133,7 +133,7 @@ def preview_sources(
         tracking_error: how far [m] any point of the robot may be from its commanded path, as the
             backend that is to execute the segments declares it.
         out: file to write.
-        config: what to plan.
+        config: what to plan; "auto" for `execution` is taken as `restore`.
         workers: how many processes, or `Workers` elsewhere.
         overwrite: replace what is at `out`.
         progress: called with (proved, wanted, rejected) after each attempt.

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 
 import pytest
 
+from sart_toolkit import pipeline
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.preview import preview_sources
-from sart_toolkit.data.storage import read_json_lines
+from sart_toolkit.collision.phases import BODY_STILLNESS, OUT_AND_BACK_STILLNESS
+from sart_toolkit.data.storage import (
+    load_demonstration,
+    read_json_lines,
+    save_annotation,
+    save_demonstration,
+)
 from sart_toolkit.errors import InvalidInput, OutputExists
 from sart_toolkit.robots import get_robot
 
@@ -112,3 +120,21 @@ def test_a_file_that_is_there_is_not_replaced_unless_asked_for(
             sources * 9, robot, peg_task.scene, 4e-4, preview[1], CONFIG, overwrite=True
         )
     assert preview[1].read_bytes() == before
+
+
+def test_where_nothing_can_be_restored_the_margin_is_that_of_replays(
+    peg_demonstration, crowded, tmp_path
+):
+    save_demonstration(tmp_path / "demo.h5", dataclasses.replace(peg_demonstration, states=()))
+    demonstration = load_demonstration(tmp_path / "demo.h5")
+    spheres = dataclasses.replace(crowded, demonstration_hash=demonstration.content_hash())
+    save_annotation(tmp_path / "annotation.json", spheres)
+    margins = []
+    for execution in ("restore", "auto"):
+        out = tmp_path / f"{execution}.jsonl"
+        files = tmp_path / "demo.h5", tmp_path / "annotation.json"
+        pipeline.preview(*files, out, n=3, execution=execution)
+        head, *rows = read_json_lines(out)
+        margins += [row["certificate"]["margin"] for row in rows if "certificate" in row][:1]
+    assert head["config"]["execution"] == "replay"
+    assert margins[1] - margins[0] == pytest.approx(OUT_AND_BACK_STILLNESS - BODY_STILLNESS)
