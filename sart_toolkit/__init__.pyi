@@ -69,6 +69,7 @@ from .backends.interface import (
 from .backends.interface import (
     require as require,
 )
+from .backends.raycast import RayCaster as RayCaster
 from .backends.states import (
     pack_state as pack_state,
 )
@@ -87,6 +88,18 @@ from .collision.exact import ExactWorld as ExactWorld
 from .collision.model import CollisionModel as CollisionModel
 from .collision.world import CollisionWorld as CollisionWorld
 from .data.assets import asset as asset
+from .data.combine import (
+    merge_datasets as merge_datasets,
+)
+from .data.combine import (
+    shorten_dataset as shorten_dataset,
+)
+from .data.combine import (
+    split_dataset as split_dataset,
+)
+from .data.combine import (
+    split_sources as split_sources,
+)
 from .data.dataset import Dataset as Dataset
 from .data.dataset import load_dataset as load_dataset
 from .data.records import (
@@ -252,6 +265,7 @@ from .robots.spec import (
 from .robots.spec import (
     look_at as look_at,
 )
+from .robots.visuals import RobotVisuals as RobotVisuals
 from .scenes.appearance import (
     AppearanceConfig as AppearanceConfig,
 )

@@ -514,6 +514,7 @@ def augment(
     overwrite: bool = False,
     progress: Progress = _silent,
     sensor: SensorErrors | None = None,
+    ask: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Dataset:
     """Trajectories generated from demonstrations' and annotations' files, in directory `out`.
@@ -529,6 +530,7 @@ def augment(
         progress: called with the trajectories kept.
         sensor: with `obstacles` "cloud", what the images may be off by; if left out, what the
             annotation says, where its spheres were suggested from the images.
+        ask: where the robot can't be reset: shows a person what to do, returns when it is done.
         options: of `AugmentConfig`. Without `n`, a strategy that draws nothing takes the
             demonstrations that there are.
 
@@ -547,6 +549,7 @@ def augment(
     return augment_sources(
         sources, make, out, config, workers, overwrite,
         lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
+        ask,
     )  # fmt: skip
 
 
@@ -733,6 +736,107 @@ def validate(
         dataset, robot_of(demonstration, robot), task_of(demonstration, task).scene,
         lambda done, wanted: progress("validate", done, wanted),
     )  # fmt: skip
+
+
+def replay(
+    dataset: Path,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
+    workers: int | Workers = 1,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """Whether a dataset's trajectories lead to the goal, also in `replay.json` in its directory.
+
+    Args:
+        dataset: directory from `augment`.
+        task, robot, backend: in place of those that its demonstrations note.
+        workers: how many processes, or `Workers` elsewhere.
+        overwrite: whether an earlier result may be replaced.
+        progress: called with the trajectories done.
+
+    Raises:
+        MissingFile, BrokenFile, MissingCapability, InvalidInput, OutputExists, Mismatch,
+        CannotWrite: as `replay_dataset`.
+        UnknownName: task, robot or backend can't be found.
+    """
+    check_names(task=task, robot=robot, backend=backend)
+    demonstration = load_dataset(dataset).sources[0].demonstration
+    from sart_toolkit.augment.trajectories import replay_dataset
+
+    make = backend_maker(demonstration, 16, demonstration.rates, task, robot, backend)
+    return replay_dataset(
+        dataset, task_of(demonstration, task), make, workers, overwrite,
+        lambda done, wanted, failed: progress("replay", done, wanted, f"{failed} failed"),
+    )  # fmt: skip
+
+
+def merge(
+    datasets: Sequence[Path], out: Path, *, overwrite: bool = False, progress: Progress = _silent
+) -> Dataset:
+    """One dataset, in directory `out`, of several of one task and robot.
+
+    Args:
+        datasets: directories from `augment`, `merge` or `split`.
+        out: directory to write; an interrupted merge resumes.
+        overwrite: whether a dataset in `out` may be replaced.
+        progress: called with the episodes done.
+
+    Raises:
+        MissingFile, BrokenFile: a dataset can't be read.
+        InvalidInput, Mismatch, OutputExists, CannotWrite: as `merge_datasets`.
+    """
+    from sart_toolkit.data.combine import merge_datasets
+
+    found = [load_dataset(path) for path in datasets]
+    return merge_datasets(found, out, overwrite, lambda *counts: progress("merge", *counts))
+
+
+def split(
+    dataset: Path,
+    out: Path,
+    *,
+    parts: Mapping[str, float] | None = None,
+    n: int | None = None,
+    by_source: bool = False,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Dataset]:
+    """Parts of a dataset as datasets of their own, by their names.
+
+    Args:
+        dataset: directory from `augment`, `merge` or `split`.
+        out: directory to write; an interrupted split resumes.
+        parts: the fraction of the episodes that each part gets, by its name; written to `out/NAME`.
+        n: one part of so many trajectories, written to `out` itself.
+        by_source: a part for each demonstration, written to `out/demoNN`.
+        seed: of which episodes `parts` get.
+        overwrite: whether datasets that are there may be replaced.
+        progress: called with the episodes done.
+
+    Raises:
+        MissingFile, BrokenFile: the dataset can't be read.
+        InvalidInput: not exactly one of `parts`, `n` and `by_source` is given; or as
+            `split_dataset` and `shorten_dataset`.
+        OutputExists, CannotWrite: as these.
+    """
+    from sart_toolkit.data.combine import shorten_dataset, split_dataset, split_sources
+
+    if (parts is not None) + (n is not None) + by_source != 1:
+        raise InvalidInput("split: expected one of parts, n and by_source; give just one")
+    found = load_dataset(dataset)
+
+    def shown(done: int, total: int) -> None:
+        progress("split", done, total)
+
+    if parts is not None:
+        return split_dataset(found, out, parts, seed, overwrite, shown)
+    if n is not None:
+        return {"": shorten_dataset(found, out, n, overwrite, shown)}
+    return split_sources(found, out, overwrite, shown)
 
 
 @_alone

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from sart_toolkit.errors import InvalidInput
 
 Array = NDArray[np.float64]
-_ORTHONORMAL_TOLERANCE = 1e-6
+_ORTHONORMAL_TOLERANCE, _LAST_ROW_TOLERANCE = 1e-6, 1e-12
 _IDENTITY, _LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -51,7 +51,24 @@ def check_pose(name: str, value: ArrayLike) -> Array:
     Raises:
         InvalidInput: wrong shape, not finite, or not a rigid transform.
     """
-    return check_poses(name, _as_array(name, value)[None])[0]
+    array = _as_array(name, value)
+    if array.shape != (4, 4):
+        raise InvalidInput(f"{name}: expected pose shape (4, 4) or (n, 4, 4), got {array.shape}")
+    T = check_array(name, array, (4, 4))
+    # One pose is checked in every control period: numbers one by one take a fraction of the time.
+    x, y, z, (*last, one) = T.tolist()
+    near = _ORTHONORMAL_TOLERANCE
+    if not (
+        all(abs(_dot(row, row) - 1.0) <= near for row in (x, y, z))
+        and all(abs(_dot(*pair)) <= near for pair in ((x, y), (y, z), (z, x)))
+        and max(*map(abs, last), abs(one - 1.0)) <= _LAST_ROW_TOLERANCE
+        and x[0] * (y[1] * z[2] - y[2] * z[1])
+        + x[1] * (y[2] * z[0] - y[0] * z[2])
+        + x[2] * (y[0] * z[1] - y[1] * z[0])
+        >= 0
+    ):
+        raise _not_rigid(name)
+    return T
 
 
 def check_poses(name: str, value: ArrayLike) -> Array:
@@ -62,8 +79,7 @@ def check_poses(name: str, value: ArrayLike) -> Array:
     """
     array = _as_array(name, value)
     if array.ndim != 3 or array.shape[1:] != (4, 4):
-        got = array.shape[1:] if array.shape[:1] == (1,) else array.shape
-        raise InvalidInput(f"{name}: expected pose shape (4, 4) or (n, 4, 4), got {got}")
+        raise InvalidInput(f"{name}: expected pose shape (4, 4) or (n, 4, 4), got {array.shape}")
     poses = check_array(name, array, (None, 4, 4))
     rotations = poses[:, :3, :3]
     if (
@@ -72,14 +88,22 @@ def check_poses(name: str, value: ArrayLike) -> Array:
         or (
             np.abs(rotations @ rotations.transpose(0, 2, 1) - _IDENTITY) > _ORTHONORMAL_TOLERANCE
         ).any()
-        or (np.abs(poses[:, 3] - _LAST_ROW) > 1e-12).any()
+        or (np.abs(poses[:, 3] - _LAST_ROW) > _LAST_ROW_TOLERANCE).any()
         or (np.linalg.det(rotations) < 0).any()
     ):
-        raise InvalidInput(
-            f"{name}: not a rigid transform (rotation not orthonormal, mirrored, or last row is"
-            " not 0 0 0 1); pass a homogeneous matrix made of a rotation and a translation"
-        )
+        raise _not_rigid(name)
     return poses
+
+
+def _dot(a: list[float], b: list[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _not_rigid(name: str) -> InvalidInput:
+    return InvalidInput(
+        f"{name}: not a rigid transform (rotation not orthonormal, mirrored, or last row is"
+        " not 0 0 0 1); pass a homogeneous matrix made of a rotation and a translation"
+    )
 
 
 def _as_array(name: str, value: ArrayLike) -> NDArray[Any]:
@@ -151,7 +175,7 @@ def log_rotation(R: Array) -> Array:
     """The rotation vector `(3,)` [rad], angle in [0, pi], of a rotation matrix `(3, 3)`."""
     v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = float(np.sqrt(v @ v))
-    cosine = 0.5 * (float(np.trace(R)) - 1.0)
+    cosine = 0.5 * (float(R[0, 0] + R[1, 1] + R[2, 2]) - 1.0)
     angle = float(np.arctan2(sine, cosine))
     if sine > 1e-6:
         return v * (angle / sine)

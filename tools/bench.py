@@ -9,7 +9,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import importlib
 import importlib.metadata
+import io
 import itertools
 import json
 import os
@@ -19,12 +21,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit import doctor
@@ -32,12 +37,14 @@ from sart_toolkit.annotate.session import AnnotationSession
 from sart_toolkit.annotate.suggest import suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
-from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.augment.preview import preview_sources
+from sart_toolkit.backends import BACKENDS, get_backend, make_backend
 from sart_toolkit.backends.interface import Backend, BackendFactory, Draws, Resets, require
 from sart_toolkit.collision.certificate import certify
 from sart_toolkit.collision.cloud import fuse_cloud
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
+from sart_toolkit.data import storage
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import (
     Annotation,
@@ -541,18 +548,244 @@ def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
 
 
 def augmentation(
-    task_name: str, image_size: int
+    task_name: str, image_size: int, backend: str = "pybullet"
 ) -> tuple[Demonstration, Annotation, BackendFactory]:
     """A demonstration of a task, its suggested spheres, and what makes its robot and scene."""
     task = get_task(task_name)
     robot = get_robot(task.robot)
-    make = functools.partial(make_backend, "pybullet", robot, task.scene, image_size)
+    make = functools.partial(make_backend, backend, robot, task.scene, image_size)
     model = RobotModel(robot, task.scene.held)
     plan = task.plan(task.initial_state(model, Placement()))
     operator = ScriptedOperator(plan, np.random.default_rng(0))
-    demonstration = record_demonstration(make(), task, model, operator)
+    with closing(make()) as robot_in_scene:
+        demonstration = record_demonstration(robot_in_scene, task, model, operator)
     world = ExactWorld(demonstration, robot, task.scene)
     return demonstration, suggest_annotation(demonstration, world), make
+
+
+# --- planning -----------------------------------------------------------------------------------
+
+
+def bench_plan(arguments: Sequence[str]) -> dict[str, Any]:
+    """Segments drawn, planned and proved a second, nothing executed, as `sart augment --dry-run`.
+
+    By task, the first tenth left out: what each process computes once, the robot's model and that
+    of each waypoint, mostly comes there. `whole_call` counts all, with the start of the processes.
+    Of one process also by its own time on the processor, which what else runs there hardly changes.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py plan", description=bench_plan.__doc__)
+    parser.add_argument("--tasks", default="all", help=f"all, {', '.join(TASKS)}")
+    parser.add_argument("--n", type=int, default=1000, help="trajectories, of each task")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args(arguments)
+    check_positive("--repeats", options.repeats)
+    tasks = list(TASKS) if options.tasks == "all" else options.tasks.split(",")
+    rates = {task: [_plan_rates(task, options) for _ in range(options.repeats)] for task in tasks}
+    return {
+        "proved_per_second": {
+            task: statistics.median(row["proved_per_second"] for row in rows)
+            for task, rows in rates.items()
+        },
+        "proved_per_second_range": {
+            task: [pick(row["proved_per_second"] for row in rows) for pick in (min, max)]
+            for task, rows in rates.items()
+        },
+        "whole_call": {
+            task: statistics.median(row["whole_call"] for row in rows)
+            for task, rows in rates.items()
+        },
+        "proved_per_processor_second": {
+            task: statistics.median(row["proved_per_processor_second"] for row in rows)
+            for task, rows in rates.items()
+        }
+        if options.workers == 1
+        else None,
+        "rejections": {task: rows[0]["rejections"] for task, rows in rates.items()},
+        "n": options.n,
+        "processes": options.workers,
+        "repeats": options.repeats,
+    }
+
+
+def _plan_rates(task_name: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Segments a second of one preview."""
+    demonstration, annotation, _ = augmentation(task_name, 64)
+    task = get_task(task_name)
+    proved: list[tuple[int, float, float]] = []
+
+    def progress(done: int, wanted: int, rejected: int) -> None:
+        proved.append((done, time.perf_counter(), time.process_time()))
+
+    with tempfile.TemporaryDirectory() as scratch:
+        started = time.perf_counter()
+        found = preview_sources(
+            [(demonstration, annotation)], get_robot(task.robot), task.scene,
+            get_backend("pybullet").tracking_error, Path(scratch) / "plan.jsonl",
+            AugmentConfig(options.n), options.workers, progress=progress,
+        )  # fmt: skip
+        seconds = time.perf_counter() - started
+    begin, end = proved[len(proved) // 10], proved[-1]
+    done, wall, processor = (b - a for a, b in zip(begin, end, strict=True))
+    _say(f"{task_name}: {done / wall:.0f} proved/s")
+    return {
+        "proved_per_second": done / wall,
+        "proved_per_processor_second": done / processor,
+        "whole_call": found.proved / seconds,
+        "rejections": dict(found.rejections),
+    }
+
+
+# --- storage ------------------------------------------------------------------------------------
+
+
+def bench_storage(arguments: Sequence[str]) -> dict[str, Any]:
+    """How small images get and how long they take to write and read, by how they are stored.
+
+    Images of generated episodes, by task and backend, in HDF5 files in memory, an image a chunk, by
+    HDF5's own filters; `ours` is what the toolkit does. With the package `hdf5plugin` its filters
+    too, which whoever opens such a file needs as well. PNG files stand beside; a depth image is
+    float32 of metres, in `png_16_bit` tenths of a millimetre. `episode`: a whole one written, its
+    hashes and flush to the disk counted, and read.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py storage", description=bench_storage.__doc__)
+    parser.add_argument("--tasks", default="peg_in_hole,toolbox_picking", help=", ".join(TASKS))
+    parser.add_argument("--backends", default="pybullet,sapien", help=", ".join(BACKENDS))
+    parser.add_argument("--image-size", type=int, default=128, help="[pixels]")
+    parser.add_argument("--episodes", type=int, default=4, help="of each task and backend")
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args(arguments)
+    for name in ("episodes", "repeats"):
+        check_positive(f"--{name}", getattr(options, name))
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        for task, backend in itertools.product(
+            options.tasks.split(","), options.backends.split(",")
+        ):
+            name = f"{task} on {backend}"
+            demonstration, annotation, make = augmentation(task, options.image_size, backend)
+            config = AugmentConfig(options.episodes + 1)
+            dataset = augment_demonstration(
+                demonstration, annotation, make, Path(scratch) / name, config
+            )
+            episodes = list(dataset)
+            figures[name] = {
+                part: _codec_figures(
+                    np.concatenate([getattr(e.steps.cameras["wrist"], part) for e in episodes]),
+                    options.repeats,
+                )
+                for part in ("rgb", "depth")
+            } | {"episode": _episode_figures(episodes, Path(scratch), options.repeats)}
+            _say(f"{name}: {figures[name]['episode']['write_ms']:.1f} ms to write an episode")
+    return {"image_size": options.image_size, "repeats": options.repeats, **figures}
+
+
+def _codecs() -> dict[str, dict[str, Any]]:
+    """What HDF5 is asked for, by a name."""
+    found: dict[str, dict[str, Any]] = {
+        "raw": {},
+        "lzf": {"compression": "lzf"},
+        "shuffle_lzf": {"compression": "lzf", "shuffle": True},
+    }
+    for level in (1, 4):
+        found[f"gzip_{level}"] = {"compression": "gzip", "compression_opts": level}
+        found[f"shuffle_gzip_{level}"] = found[f"gzip_{level}"] | {"shuffle": True}
+    try:
+        plugin = importlib.import_module("hdf5plugin")
+    except ImportError:
+        _say("hdf5plugin isn't installed: without its filters")
+        return found
+    return found | {
+        "plugin_lz4": dict(plugin.LZ4()),
+        "plugin_zstd_1": dict(plugin.Zstd(1)),
+        "plugin_bitshuffle_lz4": dict(plugin.Bitshuffle(cname="lz4")),
+        "plugin_bitshuffle_zstd": dict(plugin.Bitshuffle(cname="zstd", clevel=1)),
+        "plugin_blosc_lz4": dict(plugin.Blosc(cname="lz4", clevel=5, shuffle=1)),
+        "plugin_blosc_zstd": dict(plugin.Blosc(cname="zstd", clevel=1, shuffle=1)),
+    }
+
+
+def _codec_figures(frames: NDArray[Any], repeats: int) -> dict[str, Any]:
+    """Of each way to store images: how much smaller they get, and microseconds an image."""
+    codecs: dict[str, Callable[[], tuple[int, float, float]]] = {
+        name: functools.partial(_through_hdf5, frames, functools.partial(_put_plain, filters))
+        for name, filters in _codecs().items()
+    }
+    codecs["ours"] = functools.partial(
+        _through_hdf5, frames, storage.put_frames, storage.get_frames
+    )
+    codecs["png"] = functools.partial(_through_png, frames, False)
+    if frames.dtype == np.float32:
+        codecs["png_16_bit"] = functools.partial(_through_png, frames, True)
+    # In turn, so that whatever else the machine does slows all alike.
+    turns = [{name: codec() for name, codec in codecs.items()} for _ in range(repeats)]
+    return {
+        name: {
+            "ratio": frames.nbytes / turns[0][name][0],
+            "write_us": 1e6 * statistics.median(turn[name][1] for turn in turns) / len(frames),
+            "read_us": 1e6 * statistics.median(turn[name][2] for turn in turns) / len(frames),
+        }
+        for name in codecs
+    }
+
+
+def _put_plain(filters: dict[str, Any], file: h5py.File, name: str, frames: NDArray[Any]) -> None:
+    file.create_dataset(name, data=frames, chunks=(1, *frames.shape[1:]), **filters)
+
+
+def _through_hdf5(
+    frames: NDArray[Any],
+    put: Callable[[h5py.File, str, NDArray[Any]], None],
+    get: Callable[[h5py.Dataset], NDArray[Any]] = lambda stored: stored[()],
+) -> tuple[int, float, float]:
+    """Bytes stored, and seconds to write and to read images."""
+    content = io.BytesIO()
+    started = time.perf_counter()
+    with h5py.File(content, "w") as file:
+        put(file, "images", frames)
+    written = time.perf_counter()
+    with h5py.File(content, "r") as file:
+        n_bytes = file["images"].id.get_storage_size()
+        opened = time.perf_counter()
+        found = get(file["images"])
+        read = time.perf_counter()
+    if not np.array_equal(found, frames):
+        raise SartError("storage: images aren't read back as they were written")
+    return n_bytes, written - started, read - opened
+
+
+def _through_png(frames: NDArray[Any], sixteen_bit: bool) -> tuple[int, float, float]:
+    """Bytes of PNG files, and seconds to write and to read them; float32 as four channels."""
+    if sixteen_bit:
+        frames = np.round(1e4 * frames).astype(np.uint16)
+    elif frames.dtype == np.float32:
+        frames = frames.view(np.uint8).reshape(*frames.shape, 4)
+    files = [io.BytesIO() for _ in frames]
+    started = time.perf_counter()
+    for file, frame in zip(files, frames, strict=True):
+        Image.fromarray(frame).save(file, "png", compress_level=1)
+    written = time.perf_counter()
+    for file in files:
+        np.asarray(Image.open(file))
+    read = time.perf_counter()
+    return sum(file.tell() for file in files), written - started, read - written
+
+
+def _episode_figures(episodes: Sequence[Episode], folder: Path, repeats: int) -> dict[str, float]:
+    """Milliseconds to write an episode's file and to read it, and its size."""
+    writing, reading, sizes = [], [], []
+    for turn, (i, episode) in itertools.product(range(repeats), enumerate(episodes)):
+        path = folder / f"{turn}_{i}.h5"
+        _, seconds = _timed(storage.save_episode, path, episode)
+        writing.append(1e3 * seconds)
+        reading.append(1e3 * _timed(storage.load_episode, path)[1])
+        sizes.append(path.stat().st_size)
+        path.unlink()
+    return {
+        "write_ms": statistics.median(writing),
+        "read_ms": statistics.median(reading),
+        "kilobytes": statistics.median(sizes) / 1000,
+    }
 
 
 # --- certificates -------------------------------------------------------------------------------
@@ -1053,7 +1286,9 @@ BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "certificate": bench_certificate,
     "dataset": bench_dataset,
     "draw": bench_draw,
+    "plan": bench_plan,
     "step": bench_step,
+    "storage": bench_storage,
     "train": bench_train,
     "training-data": bench_training_data,
 }

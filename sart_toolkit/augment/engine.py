@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from sart_toolkit.augment.allocation import Allocation
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.executors import get_executor
+from sart_toolkit.augment.executors import Spare, get_executor, no_spare
 from sart_toolkit.backends.interface import Backend, BackendFactory
 from sart_toolkit.data.dataset import Dataset, Source
 from sart_toolkit.data.manifest import AttemptKey, EpisodeEntry, Rejection
@@ -36,6 +36,7 @@ class _Result(NamedTuple):
     entry: EpisodeEntry | None
     rejection: Rejection
     file: Path | None
+    resets: int
 
 
 class _Worker:
@@ -47,24 +48,26 @@ class _Worker:
         sources: Sequence[Source],
         out: Output,
         config: AugmentConfig,
+        ask: Callable[[str], None] | None,
     ) -> None:
-        self._out, self._files = out.path, EpisodeFiles(out.path)
+        numbers = [source.number for source in sources]
+        self._out, self._files = out.path, EpisodeFiles(out.path, numbers)
         self._backend = make_backend()
         pairs = [(source.demonstration, source.annotation) for source in sources]
         demonstrations = [source.demonstration for source in sources]
         executor = get_executor(config.execution, self._backend, demonstrations)
-        self._executor = executor(self._backend, pairs, config)
+        self._executor = executor(self._backend, pairs, config, ask)
 
-    def results(self, keys: Iterable[AttemptKey]) -> Iterator[_Result]:
+    def results(self, keys: Iterable[AttemptKey], spare: Spare = no_spare) -> Iterator[_Result]:
         """The results of attempts, one after the other, in the executor's order."""
-        for attempt in self._executor.attempts(keys):
+        for attempt in self._executor.attempts(keys, spare):
             episode = attempt.episode
             entry = file = None
             if episode is not None:
                 entry = dataclasses.replace(self._files.write(episode), seconds=attempt.seconds)
                 file = self._out / entry.name
             rejection = Rejection(attempt.outcome, attempt.detail, attempt.seconds)
-            yield _Result(attempt.key, entry, rejection, file)
+            yield _Result(attempt.key, entry, rejection, file, attempt.resets)
 
     def __call__(self, key: AttemptKey) -> _Result:
         (result,) = self.results([key])
@@ -83,10 +86,11 @@ def augment_demonstration(
     workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
+    ask: Callable[[str], None] | None = None,
 ) -> Dataset:
     """Generate a dataset directory from one demonstration: `augment_sources` of that alone."""
     sources = [(demonstration, annotation)]
-    return augment_sources(sources, make_backend, out, config, workers, overwrite, progress)
+    return augment_sources(sources, make_backend, out, config, workers, overwrite, progress, ask)
 
 
 def augment_sources(
@@ -97,6 +101,7 @@ def augment_sources(
     workers: int | Workers = 1,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
+    ask: Callable[[str], None] | None = None,
 ) -> Dataset:
     """Generate a dataset directory from demonstrations of one task and their annotations.
 
@@ -113,6 +118,7 @@ def augment_sources(
         workers: how many processes, or `Workers` elsewhere.
         overwrite: replace what is in `out`.
         progress: called with (kept, wanted, rejected) after each attempt.
+        ask: where the robot can't be reset: shows a person what to do, returns when it is done.
 
     Raises:
         Mismatch: an annotation belongs to another demonstration, the demonstrations to different
@@ -139,7 +145,7 @@ def augment_sources(
                 f"executor {workers.executor!r}"
             )
         if allocation.shares:
-            executor.check(backend, demonstrations, config)
+            executor.check(backend, demonstrations, config, ask)
         request = _request(backend, config)
     started = time.perf_counter()
     with DatasetWriter(out, sources, request, overwrite) as writer:
@@ -148,21 +154,35 @@ def augment_sources(
 
         resumed = writer.n_kept + writer.n_rejected > 0
 
+        given: set[AttemptKey] = set()
+
+        def spare(source: int, sphere: int) -> AttemptKey | None:
+            """One more attempt from a sphere, if those under way can't be enough."""
+            for key in allocation.missing(writer.tally):
+                if key[:2] == (source, sphere) and key not in given:
+                    given.add(key)
+                    return key
+            return None
+
+        resets = 0
         make_worker = functools.partial(
-            _Worker, make_backend, writer.sources, Output(writer.path), config
+            _Worker, make_backend, writer.sources, Output(writer.path), config, ask
         )
         with _results(make_worker, workers) as results:
             while keys := allocation.missing(writer.tally):
-                for key, entry, rejection, _ in results(keys):
+                given.clear()
+                given.update(keys)
+                for key, entry, rejection, _, reset in results(keys, spare):
+                    resets += reset
                     if entry is None:
                         writer.reject(key, rejection)
                     else:
                         writer.keep(entry)
                     if progress is not None:
                         progress(writer.n_kept, allocation.wanted, writer.n_rejected)
-        # How long an interrupted generation took in all is not known.
-        seconds = None if resumed else time.perf_counter() - started
-        return _finish(writer, sources[0][0], config, allocation.shares, seconds)
+        # How long an interrupted generation took in all, with how many resets, is not known.
+        seconds, counted = (None, None) if resumed else (time.perf_counter() - started, resets)
+        return _finish(writer, sources[0][0], config, allocation.shares, seconds, counted)
 
 
 def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
@@ -177,14 +197,14 @@ def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
 @contextmanager
 def _results(
     make_worker: Callable[[], _Worker], workers: Workers
-) -> Iterator[Callable[[Iterable[AttemptKey]], Iterator[_Result]]]:
+) -> Iterator[Callable[[Iterable[AttemptKey], Spare], Iterator[_Result]]]:
     """A function that makes attempts; a single process makes them in its executor's order."""
     if workers.here:
         with closing(make_worker()) as worker:
             yield worker.results
     else:
         with worker_map(make_worker, workers) as run:
-            yield run
+            yield lambda keys, spare: run(keys)
 
 
 def _finish(
@@ -193,6 +213,7 @@ def _finish(
     config: AugmentConfig,
     shares: Sequence[SphereShare],
     seconds: float | None,
+    resets: int | None,
 ) -> Dataset:
     wanted = sum(share.wanted or 0 for share in shares)
     if wanted and not writer.n_kept:
@@ -218,6 +239,7 @@ def _finish(
             "robot": demonstration.robot,
             "seconds": seconds,
             "simulated_seconds": writer.executed_seconds,
+            "resets": resets,
             "config": config.to_json(),
             "references": dict(demonstration.references),
         },

@@ -29,7 +29,11 @@ from sart_toolkit.record.recorder import StepRecorder
 from sart_toolkit.scenes.spec import SceneSpec
 
 # At rest, no joint is faster [rad/s]; how long [s] the robot has for it.
-_REST_SPEED, _LONGEST_REST = 0.01, 2.0
+REST_SPEED, LONGEST_REST = 0.01, 2.0
+# Where only the force is sensed, by how much [N] more than at the start means a contact.
+_MORE_FORCE = 5.0
+# How soon [s] the robot stands still where something stopped it, and is at speed on its way back.
+_STOP, _START = 0.1, 0.3
 
 
 class SegmentRun:
@@ -43,9 +47,17 @@ class SegmentRun:
     """
 
     def __init__(
-        self, backend: Backend, planner: SegmentPlanner, t: int, config: AugmentConfig
+        self,
+        backend: Backend,
+        planner: SegmentPlanner,
+        t: int,
+        config: AugmentConfig,
+        stillness: float = BODY_STILLNESS,
     ) -> None:
-        """Begin where the robot is: at waypoint `t`, the command of that waypoint in force."""
+        """Begin where the robot is: at waypoint `t`, the command of that waypoint in force.
+
+        Bodies may be up to `stillness` [m] from where the demonstration has them.
+        """
         world = planner.world
         steps = world.demonstration.steps
         self._backend, self._rates, self._recording = backend, backend.rates, config.recording
@@ -57,10 +69,14 @@ class SegmentRun:
         self._recorder = StepRecorder(backend, world.kinematics, cameras)
         # What was measured last at the end of a recorded step.
         self._step_end = start = backend.observe()
-        self._disturbance = DisturbanceCheck(backend.scene, world, t, start, config)
+        self._disturbance = DisturbanceCheck(backend.scene, world, t, start, config, stillness)
         self._measured = [start.q[None]]
         self._no_force = 0.0 if isinstance(backend, SensesForce) else np.nan
         self._pressed = self._no_force
+        # Greatest force of the first period.
+        self._force_before: float | None = None
+        # Where in a motion's time [s] the robot was sent last.
+        self._at = 0.0
         self.periods = 0
 
     @property
@@ -112,11 +128,31 @@ class SegmentRun:
         Recorded are the rest and each step but the last: that one ends at the waypoint, where the
         demonstration's own step stands.
         """
-        self._rest(motion)
+        self.rest(motion)
         rows = len(self._times(motion)) - 1 if record else 0
         if record:
             self._step_end = self._record()
         self._follow(motion, backwards=True, rows=rows)
+
+    def retreat(self, motion: Motion) -> None:
+        """Stop on the way out, and go back along the motion's path to the waypoint; check nothing.
+
+        The motion's time slows down and runs back, so that the robot stays on its path.
+        """
+        steps = np.arange(1, 1 + round(_STOP * self._rates.physics_hz))
+        u = steps / len(steps)
+        stopping = self._at + _STOP * (u - _ramp(u))
+        back = np.arange(1, 1 + round((self._at + _STOP + _START) * self._rates.physics_hz))
+        u = back / (_START * self._rates.physics_hz)
+        returning = stopping[-1] - _START * (_ramp(np.minimum(u, 1.0)) + np.maximum(u - 1.0, 0.0))
+        times = np.maximum(np.concatenate([stopping, returning]), 0.0)
+        # Whole control periods; it rests at the waypoint by then.
+        missing = -len(times) % self._rates.physics_per_control
+        times = np.concatenate([times, np.zeros(missing)])
+        for targets in self._periods(motion.joints(times)):
+            self._backend.command(targets, self._gripper)
+            self._backend.step()
+            self.periods += 1
 
     def _times(self, motion: Motion) -> Array:
         return motion.times(self._rates.record_hz)
@@ -137,7 +173,10 @@ class SegmentRun:
         per_record = self._rates.control_per_record
         for i, (time, wanted, now) in enumerate(zip(times, targets, sent, strict=False), 1):
             # As a policy will be at its own rate, held to what was measured a recorded step ago.
-            self._controller.follow(wanted, motion.T_world_tool(time), self._step_end.T_world_tool)
+            self._controller.follow(
+                wanted, motion.T_world_tool(time), self._step_end.T_world_tool, now[-1]
+            )
+            self._at = time
             self._send(now)
             if i % per_record:
                 self._measure()
@@ -152,19 +191,19 @@ class SegmentRun:
         """Targets `(steps, n)` of a control period at rest at the end of a motion."""
         return motion.path.positions(np.ones(self._rates.physics_per_control))
 
-    def _rest(self, motion: Motion) -> None:
-        """Stay at the end of a motion until the joints rest, for whole recorded steps."""
+    def rest(self, motion: Motion) -> None:
+        """Stay at the sampled pose until the joints rest, for whole recorded steps."""
         per_record = self._rates.control_per_record
-        for _ in range(round(_LONGEST_REST * self._rates.record_hz)):
+        for _ in range(round(LONGEST_REST * self._rates.record_hz)):
             self._pressed = self._no_force
             for _ in range(per_record):
                 self._send(self._at_end(motion))
                 self._step_end = self._measure()
-            if np.abs(self._step_end.dq).max() <= _REST_SPEED:
+            if np.abs(self._step_end.dq).max() <= REST_SPEED:
                 return
         raise MotionRejected(
             f"no rest at the sampled pose: a joint moves by "
-            f"{np.abs(self._step_end.dq).max():.3f} rad/s after {_LONGEST_REST:g} s"
+            f"{np.abs(self._step_end.dq).max():.3f} rad/s after {LONGEST_REST:g} s"
         )
 
     def _periods(self, targets: Array) -> Array:
@@ -181,6 +220,17 @@ class SegmentRun:
             self._pressed = max(self._pressed, backend.force())
         if isinstance(backend, SensesContacts):
             check_untouched(backend.scene, backend.contacts(), self._grasped)
+        elif isinstance(backend, SensesForce):
+            self._check_force(backend.force())
+
+    def _check_force(self, force: float) -> None:
+        if self._force_before is None:
+            self._force_before = force
+        if not force - self._force_before <= _MORE_FORCE:
+            raise MotionRejected(
+                f"contact force: {force:.1f} N, {self._force_before:.1f} N before it moved; "
+                "stopped there"
+            )
 
     def _measure(self) -> Observation:
         return self._checked(self._backend.observe())
@@ -196,6 +246,11 @@ class SegmentRun:
         return seen
 
 
+def _ramp(u: Array) -> Array:
+    """How far a speed takes that rises from 0 at u = 0 smoothly to 1 at u = 1; then it is 1 / 2."""
+    return np.asarray(u**6 - 3 * u**5 + 2.5 * u**4)
+
+
 def segment_proof(
     planner: SegmentPlanner,
     t: int,
@@ -203,6 +258,7 @@ def segment_proof(
     certificate: Certificate,
     joint_path: Array,
     backend: Backend,
+    stillness: float = BODY_STILLNESS,
 ) -> dict[str, Any]:
     """What is proved about a segment: of the path commanded, and of the one measured.
 
@@ -213,6 +269,7 @@ def segment_proof(
         certificate: the proof of that.
         joint_path: the joints `(m, n)` [rad] as measured.
         backend: what executed it.
+        stillness: how far [m] bodies may have been from where the demonstration has them.
 
     Raises:
         MotionRejected: the measured path is farther off than the backend's tracking error, or
@@ -228,7 +285,7 @@ def segment_proof(
             f"left its path: by up to {deviation * 1e3:.2f} mm, backend {backend.name!r} declares "
             f"a tracking error of {declared * 1e3:.2f} mm; allow more time"
         )
-    measured = world.certify(t, PolylinePath(joint_path), planner.measured_margin)
+    measured = world.certify(t, PolylinePath(joint_path), planner.measured_margin(stillness))
     if measured.verdict != "free":
         raise MotionRejected(
             f"left its path {' / '.join(measured.pair)}: by {deviation * 1e3:.1f} mm, "
@@ -239,7 +296,7 @@ def segment_proof(
         "measured": measured.to_json(),
         "deviation": deviation,
         "tracking_error": declared,
-        "body_stillness": BODY_STILLNESS,
+        "body_stillness": stillness,
         "duration": motion.duration,
     }
 
@@ -273,6 +330,7 @@ class DisturbanceCheck:
         t: int,
         start: Observation,
         config: AugmentConfig,
+        stillness: float = BODY_STILLNESS,
     ) -> None:
         """Compare with how things stood at waypoint `t`.
 
@@ -283,11 +341,12 @@ class DisturbanceCheck:
             start: what was measured before anything moved. It stands in for the demonstration,
                 where that doesn't tell where bodies were.
             config: says how far an object may slip in the grasp.
+            stillness: how far [m] any other body may be from where it was.
         """
         demonstration = world.demonstration
         self._openings = world.openings(t)
         self._grasped = world.phases[t].grasped
-        self._slip_tolerance = config.slip_tolerance
+        self._slip_tolerance, self._stillness = config.slip_tolerance, stillness
         self._T_world_tool = demonstration.steps.measured_Ts_world_tool[t]
         self._Ts_world_body, self._corners = {}, {}
         for body in scene.bodies:
@@ -311,21 +370,28 @@ class DisturbanceCheck:
                 f"gripper left its range: it is at {seen.gripper:.3f}, the proof is for "
                 f"{low:.3f} to {high:.3f}"
             )
-        for name, T in self._Ts_world_body.items():
-            change = seen.Ts_world_body[name] - T
-            most, what = BODY_STILLNESS, "was moved"
-            if name in self._grasped:
-                most, what = self._slip_tolerance, "slipped in the grasp"
-                change = (
-                    inverse(seen.T_world_tool) @ seen.Ts_world_body[name]
-                    - inverse(self._T_world_tool) @ T
-                )
-            # The farthest that any point of the body has moved.
-            moved = self._corners[name] @ change[:3, :3].T + change[:3, 3]
-            far = float(np.linalg.norm(moved, axis=1).max())
+        for name in self._Ts_world_body:
+            grasped = name in self._grasped
+            most = self._slip_tolerance if grasped else self._stillness
+            far = self._moved(name, seen)
             # Written so that what is no number is rejected.
             if not far <= most:
+                what = "slipped in the grasp" if grasped else "was moved"
                 raise MotionRejected(f"{name} {what}: by {far * 1e3:.2f} mm")
+
+    def moved(self, seen: Observation) -> float:
+        """How far [m] any body that isn't grasped is from where it was."""
+        others = self._Ts_world_body.keys() - self._grasped
+        return max((self._moved(name, seen) for name in others), default=0.0)
+
+    def _moved(self, name: str, seen: Observation) -> float:
+        """How far [m] any point of a body has moved; if it is grasped, in the grasp."""
+        before, now = self._Ts_world_body[name], seen.Ts_world_body[name]
+        if name in self._grasped:
+            before, now = inverse(self._T_world_tool) @ before, inverse(seen.T_world_tool) @ now
+        change = now - before
+        moved = self._corners[name] @ change[:3, :3].T + change[:3, 3]
+        return float(np.linalg.norm(moved, axis=1).max())
 
 
 def joint_rows(seen: Observation) -> Array:

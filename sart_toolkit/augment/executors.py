@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from sart_toolkit.augment.config import AugmentConfig
-from sart_toolkit.augment.execution import SegmentRun, recorded_cameras, segment_proof
+from sart_toolkit.augment.execution import (
+    SegmentRun,
+    recorded_cameras,
+    segment_proof,
+)
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
 from sart_toolkit.augment.strategies import Proposal
 from sart_toolkit.backends.interface import Backend, SavesStates, require
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.data.manifest import KEPT, AttemptKey
-from sart_toolkit.data.records import Annotation, Demonstration, Episode, Provenance
+from sart_toolkit.data.records import Annotation, Demonstration, Episode, Provenance, Steps
 from sart_toolkit.errors import Mismatch, MotionRejected, Unreachable
 from sart_toolkit.motion.timing import Motion
+from sart_toolkit.poses import Array
 from sart_toolkit.registry import expect_class, resolve
 
+# Gives a further attempt from the sphere of a source (both numbers), if one is needed.
+Spare = Callable[[int, int], AttemptKey | None]
 _FROM_STATES = "segments start from the demonstration's saved states"
 
 
@@ -27,7 +34,8 @@ class Attempt:
 
     `outcome` is the same for all attempts that fail alike; `detail` gives this one's figures.
     `seconds`: for how long [s] the robot moved, on its own clock; 0 for what was never executed,
-    `None` where the executor doesn't tell.
+    `None` where the executor doesn't tell; what it did since the attempt before counts. `resets`:
+    how often robot and scene were put back to the demonstration's start since then.
     """
 
     key: AttemptKey
@@ -35,6 +43,12 @@ class Attempt:
     episode: Episode | None
     detail: str = ""
     seconds: float | None = None
+    resets: int = 0
+
+
+def no_spare(source: int, sphere: int) -> AttemptKey | None:
+    """No further attempt."""
+    return None
 
 
 class SegmentExecutor(abc.ABC):
@@ -52,9 +66,19 @@ class SegmentExecutor(abc.ABC):
         backend: Backend,
         sources: Sequence[tuple[Demonstration, Annotation | None]],
         config: AugmentConfig,
+        ask: Callable[[str], None] | None = None,
     ) -> None:
-        """Make attempts on `backend`, the robot in the demonstrations' scene."""
+        """Make attempts on `backend`, the robot in the demonstrations' scene.
+
+        Args:
+            backend: the robot.
+            sources: the demonstrations, with their annotations.
+            config: what to generate.
+            ask: shows a person what to do beside the robot, and returns when it is done; `None`
+                where nobody is there.
+        """
         self._backend, self._sources, self._config = backend, sources, config
+        self._ask = ask
         self._planners: dict[int, SegmentPlanner] = {}
 
     @property
@@ -64,7 +88,11 @@ class SegmentExecutor(abc.ABC):
 
     @classmethod
     def check(
-        cls, backend: Backend, demonstrations: Sequence[Demonstration], config: AugmentConfig
+        cls,
+        backend: Backend,
+        demonstrations: Sequence[Demonstration],
+        config: AugmentConfig,
+        ask: Callable[[str], None] | None = None,
     ) -> None:
         """Return if attempts at segments of the demonstrations can be made on `backend`.
 
@@ -82,8 +110,11 @@ class SegmentExecutor(abc.ABC):
                 )
 
     @abc.abstractmethod
-    def attempts(self, keys: Iterable[AttemptKey]) -> Iterator[Attempt]:
+    def attempts(self, keys: Iterable[AttemptKey], spare: Spare = no_spare) -> Iterator[Attempt]:
         """The attempts with the given keys, each once, in an order of the executor's choice.
+
+        An executor that would have to come back for more may ask for a `spare` where an attempt
+        gave no episode; otherwise the caller asks it for these later.
 
         What isn't proved to keep the margin is not executed. Any contact of the robot, or of what
         it holds or has grasped there, with anything else at any physics step ends the execution. So
@@ -112,15 +143,18 @@ class SegmentExecutor(abc.ABC):
         proposal: Proposal,
         motion: Motion,
         certificate: Certificate,
-        run: SegmentRun,
+        steps: Steps,
+        path: Array,
+        stillness: float,
     ) -> Episode:
-        """The episode of an executed segment, its measured path proved clear.
+        """The episode of an executed segment, its measured joint path `(m, n)` proved clear.
+
+        Bodies were up to `stillness` [m] from where the demonstration has them.
 
         Raises:
             MotionRejected: that can't be proved.
         """
-        path, config = run.joint_path, self._config
-        t = proposal.t_star
+        config, t = self._config, proposal.t_star
         provenance = Provenance(
             demonstration_hash=self.planner(key.source).demonstration_hash,
             source=key.source,
@@ -132,12 +166,12 @@ class SegmentExecutor(abc.ABC):
             strategy=str(config.strategy),
             distribution=config.sampling.distribution,
             certificate=segment_proof(
-                self.planner(key.source), t, motion, certificate, path, self._backend
+                self.planner(key.source), t, motion, certificate, path, self._backend, stillness
             ),
             merged=proposal.merged,
             recording=config.recording,
         )
-        return Episode(run.steps(), provenance, path)
+        return Episode(steps, provenance, path)
 
 
 def rejected_outcome(error: Unreachable | MotionRejected) -> str:
@@ -161,7 +195,11 @@ class RestoreExecutor(SegmentExecutor):
 
     @classmethod
     def check(
-        cls, backend: Backend, demonstrations: Sequence[Demonstration], config: AugmentConfig
+        cls,
+        backend: Backend,
+        demonstrations: Sequence[Demonstration],
+        config: AugmentConfig,
+        ask: Callable[[str], None] | None = None,
     ) -> None:
         """Return if attempts at segments of the demonstrations can be made on `backend`.
 
@@ -180,13 +218,13 @@ class RestoreExecutor(SegmentExecutor):
                     f"{demonstration.backend!r} has saved with the demonstration; augment on "
                     f"{demonstration.backend!r}, or record a demonstration on {backend.name!r}"
                 )
-        super().check(backend, demonstrations, config)
+        super().check(backend, demonstrations, config, ask)
         if not all(demonstration.states for demonstration in demonstrations):
             raise Mismatch(
                 "the demonstration holds no saved states; record it on a backend that can restore"
             )
 
-    def attempts(self, keys: Iterable[AttemptKey]) -> Iterator[Attempt]:
+    def attempts(self, keys: Iterable[AttemptKey], spare: Spare = no_spare) -> Iterator[Attempt]:
         """The attempts in the order of their keys."""
         return map(self.attempt, keys)
 
@@ -204,27 +242,36 @@ class RestoreExecutor(SegmentExecutor):
         try:
             motion, certificate = planner.plan(proposal, rng, self.tracking_error)
             require(self._backend, SavesStates, _FROM_STATES).restore(demonstration.states[t])
-            run = SegmentRun(self._backend, planner, t, self._config)
+            run = SegmentRun(self._backend, planner, t, self._config, planner.stillness)
             run.execute(planner.approach(t), motion)
-            episode = self._episode(key, proposal, motion, certificate, run)
+            episode = self._episode(
+                key, proposal, motion, certificate, run.steps(), run.joint_path, planner.stillness
+            )
         except (Unreachable, MotionRejected) as error:
             return rejected(key, error, run)
         return Attempt(key, KEPT, episode, seconds=run.seconds)
 
 
-EXECUTORS = {"restore": "sart_toolkit.augment.executors:RestoreExecutor"}
+EXECUTORS = {
+    "restore": "sart_toolkit.augment.executors:RestoreExecutor",
+    "replay": "sart_toolkit.augment.replay:ReplayExecutor",
+}
 
 
 def get_executor(
     name: str, backend: Backend, demonstrations: Sequence[Demonstration]
 ) -> type[SegmentExecutor]:
-    """The class of executors that a name or reference names, or, by "auto", the one that can do it.
+    """The class of executors that a name or reference names.
+
+    "auto" is `restore` where the backend saves states and the demonstrations hold some, of whatever
+    backend, else `replay`.
 
     Raises:
         UnknownName: there is none; the message says which part is wrong.
     """
     if name == "auto":
-        name = "restore"
+        states = all(demonstration.states for demonstration in demonstrations)
+        name = "restore" if states and isinstance(backend, SavesStates) else "replay"
     found: type[SegmentExecutor] = expect_class(
         "executor", name, resolve("executor", name, EXECUTORS), SegmentExecutor
     )

@@ -10,7 +10,7 @@ from sart_toolkit.augment.strategies import Proposal
 from sart_toolkit.collision import make_world
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
-from sart_toolkit.collision.phases import BODY_STILLNESS
+from sart_toolkit.collision.phases import BODY_STILLNESS, OUT_AND_BACK_STILLNESS
 from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import MotionRejected, Unreachable
@@ -63,9 +63,18 @@ class SegmentPlanner:
         return strategy.propose(demonstration, self._spheres, sphere, rng, sampling), rng
 
     @property
-    def measured_margin(self) -> float:
+    def stillness(self) -> float:
+        """How far [m] bodies may be from where the demonstration has them, unless more is needed.
+
+        What rests on a table creeps, and a way out and back takes twice as long.
+        """
+        config = self._config
+        back = config.recording == "return" or config.execution == "replay"
+        return OUT_AND_BACK_STILLNESS if back else BODY_STILLNESS
+
+    def measured_margin(self, stillness: float) -> float:
         """What a measured path has to keep free [m]: `margin`, and what bodies may have moved."""
-        return round(self._config.margin + BODY_STILLNESS, _DIGITS)
+        return round(self._config.margin + stillness, _DIGITS)
 
     def approach(self, t: int) -> Array:
         """The joint targets `(m, n)` [rad], one a physics step, before a segment from waypoint `t`.
@@ -84,7 +93,11 @@ class SegmentPlanner:
         return self._approaches[t]
 
     def plan(
-        self, proposal: Proposal, rng: np.random.Generator, tracking_error: float
+        self,
+        proposal: Proposal,
+        rng: np.random.Generator,
+        tracking_error: float,
+        stillness: float | None = None,
     ) -> tuple[Motion, Certificate]:
         """The motion from waypoint t* to a drawn pose, and the proof that it keeps the margin.
 
@@ -96,6 +109,8 @@ class SegmentPlanner:
             proposal: what `proposal` drew.
             rng: the random numbers that follow it.
             tracking_error: how far [m] any point of the robot may be from its commanded path.
+            stillness: how far [m] bodies may be from where the demonstration has them; the
+                planner's if left out.
 
         Raises:
             Unreachable: no joint configuration reaches some pose.
@@ -103,7 +118,8 @@ class SegmentPlanner:
                 at t*.
         """
         config, t = self._config, proposal.t_star
-        margin = round(self.measured_margin + tracking_error, _DIGITS)
+        stillness = self.stillness if stillness is None else stillness
+        margin = round(self.measured_margin(stillness) + tracking_error, _DIGITS)
         demonstration = self.world.demonstration
         steps, record_hz = demonstration.steps, demonstration.rates.record_hz
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]

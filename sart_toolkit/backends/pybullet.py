@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import os
 import tempfile
 import xml.etree.ElementTree as ET
@@ -58,7 +59,6 @@ def _without_greetings() -> Iterator[None]:
 
 with _without_greetings():
     import pybullet as p
-    from pybullet_utils.bullet_client import BulletClient
 
 # As a prism, which is what a cylinder becomes otherwise, it would be a millimetre larger.
 _URDF_FLAGS = (
@@ -68,6 +68,19 @@ _URDF_FLAGS = (
 # pixel away: they are never quite at rest, and what moves with the camera is drawn once.
 _GRIPPER_STEP = 5e-5
 _MOST_FOUND = 32
+_MOST_STATES = 16
+
+
+class _Client:
+    """PyBullet's functions, each bound to one simulation when first used."""
+
+    def __init__(self) -> None:
+        self._id = p.connect(p.DIRECT)
+
+    def __getattr__(self, name: str) -> Any:
+        bound = functools.partial(getattr(p, name), physicsClientId=self._id)
+        setattr(self, name, bound)
+        return bound
 
 
 class PyBulletBackend(Simulator):
@@ -95,7 +108,7 @@ class PyBulletBackend(Simulator):
         super().__init__(robot, scene, image_size, rates)
         self._model = RobotModel(robot, scene.held)
         with _without_greetings():
-            self._client: Any = BulletClient(p.DIRECT)
+            self._client: Any = _Client()
         c = self._client
         c.setTimeStep(1.0 / rates.physics_hz)
         c.setGravity(*scene.gravity)
@@ -107,6 +120,9 @@ class PyBulletBackend(Simulator):
         self._bodies: dict[str, tuple[int, int]] = {}
         self._springs: list[tuple[int, int, Joint]] = []
         self._Ts_body_centre: dict[int, Array] = {}
+        self._Ts_centre_body: dict[int, Array] = {}
+        # Where bodies are that stay where a reset or restore has put them.
+        self._still: dict[str, Array] = {}
         for body in scene.bodies:
             if body.joint is None:
                 self._load_bodies(body)
@@ -124,6 +140,9 @@ class PyBulletBackend(Simulator):
         self._scene_digest = scene_digest(self._model, scene)
         self._targets = PeriodTargets(self._model, rates.physics_per_control)
         self._drawing: _Drawing | None = None
+        # What PyBullet calls the states that it has in memory, by their bytes: it reads a file for
+        # 10 ms, and segments start from few states again and again.
+        self._known_states: dict[bytes, int] = {}
         # The bytes restored last, until something changes: Bullet renumbers contacts each time.
         self._restored: bytes | None = None
 
@@ -137,6 +156,7 @@ class PyBulletBackend(Simulator):
         # PyBullet's base is a body's centre of mass with its principal axes.
         dynamics = c.getDynamicsInfo(index, -1)
         self._Ts_body_centre[index] = _matrix(dynamics[3], dynamics[4])
+        self._Ts_centre_body[index] = inverse(self._Ts_body_centre[index])
         for link in range(c.getNumJoints(index)):
             body = moving[c.getJointInfo(index, link)[12].decode()]
             assert body.joint is not None
@@ -247,7 +267,7 @@ class PyBulletBackend(Simulator):
         self.check_cameras(cameras)
         states = c.getJointStates(self._robot, self._arm)
         closed = self.robot.gripper.closed_position
-        Ts_world_body = self.body_poses()
+        T_world_tool, Ts_world_body = self._poses()
         views = {}
         if cameras:
             linkage = c.getJointStates(self._robot, list(self._gripper.values()))
@@ -262,7 +282,7 @@ class PyBulletBackend(Simulator):
             q=np.array([s[0] for s in states]),
             dq=np.array([s[1] for s in states]),
             gripper=c.getJointState(self._robot, self._driver)[0] / closed,
-            T_world_tool=self._frame_pose(self.robot.tool_frame),
+            T_world_tool=T_world_tool,
             time=self._time,
             cameras=views,
             Ts_world_body=Ts_world_body,
@@ -270,24 +290,26 @@ class PyBulletBackend(Simulator):
         )
 
     def body_poses(self) -> dict[str, Array]:
-        Ts = {body.name: self._frame_pose(body.name) for body in self.scene.held}
+        return self._poses()[1]
+
+    def _poses(self) -> tuple[Array, dict[str, Array]]:
+        """Where the tool is, and where the bodies are."""
+        c = self._client
+        links = [self._tool_link, *(self._links[body.name] for body in self.scene.held)]
+        T_world_tool, *held = (
+            _matrix(state[4], state[5]) for state in c.getLinkStates(self._robot, links, 0, 1)
+        )
+        Ts = {body.name: T for body, T in zip(self.scene.held, held, strict=True)}
         for name, (index, link) in self._bodies.items():
             if link >= 0:
-                Ts[name] = self._link_pose(index, link)
+                state = c.getLinkState(index, link, 0, 1)
+                Ts[name] = _matrix(state[4], state[5])
+            elif name in self._still:
+                Ts[name] = self._still[name].copy()
             else:
-                T_world_centre = _matrix(*self._client.getBasePositionAndOrientation(index))
-                Ts[name] = T_world_centre @ inverse(self._Ts_body_centre[index])
-        return Ts
-
-    def _frame_pose(self, frame: str) -> Array:
-        """Where a frame of the robot, or "world", is."""
-        link = -1 if frame == "world" else self._links[frame]
-        # The robot's base stands at the world's origin.
-        return np.eye(4) if link < 0 else self._link_pose(self._robot, link)
-
-    def _link_pose(self, index: int, link: int) -> Array:
-        state = self._client.getLinkState(index, link, 0, 1)
-        return _matrix(state[4], state[5])
+                T_world_centre = _matrix(*c.getBasePositionAndOrientation(index))
+                Ts[name] = T_world_centre @ self._Ts_centre_body[index]
+        return T_world_tool, Ts
 
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
         q = self._model.check_limits(state.q)
@@ -312,19 +334,19 @@ class PyBulletBackend(Simulator):
         return sent
 
     def step(self) -> None:
-        c, robot = self._client, self._robot
-        arm, n = self._arm, len(self._arm)
-        ones = [1.0] * n
+        c, robot, arm = self._client, self._robot, self._arm
+        n = len(arm)
+        ones, zeros = [1.0] * n, [0.0] * n
         gripper = self.robot.gripper
         self._touched = {}
         self._joint_path = []
         self._restored = None
-        for target in self._targets.rows:
+        for target in self._targets.rows.tolist():
             # Position gain 1 closes the whole error within one physics step. A velocity target
             # beside it would put the arm one physics step ahead of its targets.
             c.setJointMotorControlArray(
-                robot, arm, p.POSITION_CONTROL, target[:n].tolist(),
-                targetVelocities=[0.0] * n,
+                robot, arm, p.POSITION_CONTROL, target[:n],
+                targetVelocities=zeros,
                 forces=self._forces, positionGains=ones, velocityGains=ones,
             )  # fmt: skip
             c.setJointMotorControl2(
@@ -336,13 +358,15 @@ class PyBulletBackend(Simulator):
                 c.setJointMotorControl2(index, link, p.TORQUE_CONTROL, force=effort)
             c.stepSimulation()
             self._joint_path.append([s[0] for s in c.getJointStates(robot, arm)])
-            self._collect_contacts()
+            points = c.getContactPoints()
+            if points:
+                self._collect_contacts(points)
         self._targets.advance()
         self._time += 1.0 / self.rates.control_hz
 
-    def _collect_contacts(self) -> None:
+    def _collect_contacts(self, points: Sequence[Any]) -> None:
         forces: dict[tuple[str, str], float] = {}
-        for point in self._client.getContactPoints():
+        for point in points:
             distance, force = point[8], point[9]
             if distance > 0.0 and force <= 0.0:
                 continue
@@ -383,8 +407,26 @@ class PyBulletBackend(Simulator):
         head, world = unpack_state(
             self.name, state, self.robot.name, self._scene_digest, sorted(self._bodies)
         )
-        # Existing contacts would keep forces that the file doesn't have.
+        # Existing contacts would keep forces that the state doesn't have.
         self._forget_contacts()
+        if state in self._known_states:
+            self._client.restoreState(self._known_states[state])
+        else:
+            self._restore_file(world)
+            if len(self._known_states) >= _MOST_STATES:
+                oldest = next(iter(self._known_states))
+                self._client.removeState(self._known_states.pop(oldest))
+            self._known_states[state] = self._client.saveState()
+        self._targets.take(head)
+        self._time = head["time"]
+        self._touched = {}
+        self._joint_path = []
+        self._still = {}
+        Ts_world_body = self.body_poses()
+        self._still = {b.name: Ts_world_body[b.name] for b in self.scene.bodies if b.mass is None}
+        self._restored = state
+
+    def _restore_file(self, world: bytes) -> None:
         handle, path = tempfile.mkstemp(suffix=".bullet")
         try:
             with os.fdopen(handle, "wb") as file:
@@ -394,11 +436,6 @@ class PyBulletBackend(Simulator):
             raise BrokenFile(f"saved state: PyBullet refuses it ({error})") from error
         finally:
             os.unlink(path)
-        self._targets.take(head)
-        self._time = head["time"]
-        self._touched = {}
-        self._joint_path = []
-        self._restored = state
 
     def close(self) -> None:
         if self._client is not None:
@@ -484,10 +521,8 @@ def _urdf_file(root: Body, moving: Iterable[Body]) -> Iterator[str]:
 
 
 def _matrix(position: Sequence[float], quaternion: Sequence[float]) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = np.array(p.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
-    T[:3, 3] = position
-    return T
+    R, (x, y, z) = p.getMatrixFromQuaternion(quaternion), position
+    return np.array([[*R[:3], x], [*R[3:6], y], [*R[6:], z], [0.0, 0.0, 0.0, 1.0]])
 
 
 def _quaternion(T: Array) -> list[float]:

@@ -90,7 +90,9 @@ class RayCaster:
         ).reshape(-1, 4, 4)
         corners = self._corners @ Ts[:, :3, :3].transpose(0, 2, 1) + Ts[:, None, :3, 3]
         # What is near hides what is far, whose rays then end early.
-        order = np.argsort(np.linalg.norm(corners.mean(axis=1), axis=1), kind="stable")
+        middles = corners.mean(axis=1)
+        order = np.argsort((middles * middles).sum(axis=1), kind="stable")
+        in_view = _in_view(camera, size, corners)
         fixed = [i for i in order if self._names[i] in carried]
         key = (
             *(camera.fov_y_deg, camera.near, camera.far, size),
@@ -104,7 +106,7 @@ class RayCaster:
                 self._carried[key].add(i, self._bodies[i], Ts[i], corners[i])
         image = self._carried[key].copy()
         for i in order:
-            if self._names[i] not in carried:
+            if in_view[i] and self._names[i] not in carried:
                 image.add(i, self._bodies[i], Ts[i], corners[i])
         to_light = T_camera_world[:3, :3] @ self._light.direction
         facing = image.facing(to_light)
@@ -112,6 +114,17 @@ class RayCaster:
             lit = np.flatnonzero(facing > 0)
             facing[lit[image.hidden(lit, self._bodies, Ts, corners, to_light)]] = 0.0
         return image.shown(facing, self._palette, self._light, T_world_camera)
+
+
+def _in_view(camera: CameraSpec, size: tuple[int, int], corners: Array) -> NDArray[np.bool_]:
+    """Whether boxes, by their corners `(n, 8, 3)`, may be in a camera's view, in its frame."""
+    x, y, z = corners.transpose(2, 0, 1)
+    across, up = np.array(size) / (2 * camera.intrinsics(*size)[0, 0])
+    limits = np.stack(
+        [z - camera.near, camera.far - z, across * z - x, across * z + x, up * z - y, up * z + y]
+    )
+    # A box is out of it where all of its corners are beyond one limit.
+    return np.asarray((limits > 0).any(axis=2).all(axis=0))
 
 
 class _Body(NamedTuple):
@@ -179,7 +192,8 @@ class _Image:
 
     Attributes:
         depth: along z [m], the camera's farthest where nothing was hit yet.
-        normal: of the surface, in the camera's frame `(n, 3)`.
+        shades: of each body drawn, its pixels, normals `(k, 3)` in the camera's frame, and which of
+            them each pixel shows.
         colour: place in the palette, -1 where nothing was hit yet.
         body: the number of the body hit.
     """
@@ -187,9 +201,9 @@ class _Image:
     def __init__(self, camera: CameraSpec, size: tuple[int, int]) -> None:
         self._camera, self._size = camera, size
         self._rays = _rays(camera.fov_y_deg, *size)
-        n = len(self._rays)
+        n = self._rays.shape[1]
         self.depth = np.full(n, camera.far, np.float32)
-        self.normal = np.zeros((n, 3), np.float32)
+        self.shades: list[tuple[_Indices, _Floats, _Indices]] = []
         self.colour = np.full(n, -1, np.int16)
         self.body = np.full(n, -1, np.int16)
 
@@ -197,7 +211,7 @@ class _Image:
         """The same image, to be drawn on alone."""
         made = _Image.__new__(_Image)
         made._camera, made._size, made._rays = self._camera, self._size, self._rays
-        made.depth, made.normal = self.depth.copy(), self.normal.copy()
+        made.depth, made.shades = self.depth.copy(), self.shades.copy()
         made.colour, made.body = self.colour.copy(), self.body.copy()
         return made
 
@@ -207,65 +221,67 @@ class _Image:
         if not len(pixels):
             return
         if len(body.planes):
-            pixels, depth, normal = self._meet(body, T_camera_body, pixels)
-            colour = body.colours[0]
+            pixels, depth, normals, shown = self._meet(body, T_camera_body, pixels)
+            self.colour[pixels] = body.colours[0]
         else:
-            pixels, depth, normal, colour = self._cast(body, T_camera_body, pixels)
+            pixels, depth, triangles, normals, shown = self._cast(body, T_camera_body, pixels)
+            self.colour[pixels] = body.colours[triangles]
         self.depth[pixels] = depth
-        self.normal[pixels] = normal
-        self.colour[pixels] = colour
+        self.shades.append((pixels, normals, shown))
         self.body[pixels] = number
 
     def _cast(
         self, body: _Body, T_camera_body: Array, pixels: _Indices
-    ) -> tuple[_Indices, _Floats, _Floats, _Indices]:
-        """Those pixels whose rays hit a body's triangles, with depth, normal and colour."""
+    ) -> tuple[_Indices, _Floats, _Indices, _Floats, _Indices]:
+        """Those pixels whose rays hit a body's triangles, their depth, and which triangle it is.
+
+        Then normals, and which of them each shows.
+        """
         near = np.float32(self._camera.near)
         R = T_camera_body[:3, :3].astype(np.float32)
-        rays = self._rays.take(pixels, axis=0) @ R
+        rays = R.T @ self._rays.take(pixels, axis=1)
         start = (-T_camera_body[:3, 3] @ T_camera_body[:3, :3]).astype(np.float32)
-        hit = body.scene.run(start + near * rays, rays, self.depth[pixels] - near, output=1)
+        starts = start[:, None] + near * rays
+        hit = body.scene.run(starts.T, rays.T, self.depth[pixels] - near, output=1)
         at = np.flatnonzero(hit["primID"] >= 0)
         triangle = hit["primID"][at]
-        normal = body.normals.take(triangle, axis=0)
-        if normal.shape[1] == 1:
-            normal = normal[:, 0]
+        if body.normals.shape[1] == 1:
+            normals, shown = body.normals[:, 0], triangle
         else:
             u, v = hit["u"][at, None], hit["v"][at, None]
-            normal = (1 - u - v) * normal[:, 0] + u * normal[:, 1] + v * normal[:, 2]
-            normal /= np.sqrt(np.einsum("ni,ni->n", normal, normal))[:, None]
-        return pixels[at], hit["tfar"][at] + near, normal @ R.T, body.colours[triangle]
+            corners = body.normals.take(triangle, axis=0)
+            normals = (1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
+            normals /= np.sqrt(np.einsum("ni,ni->n", normals, normals))[:, None]
+            shown = np.arange(len(at))
+        return pixels[at], hit["tfar"][at] + near, triangle, normals @ R.T, shown
 
     def _meet(
         self, body: _Body, T_camera_body: Array, pixels: _Indices
-    ) -> tuple[_Indices, _Floats, _Floats]:
-        """The same for a convex body with few faces, whose planes the rays meet.
+    ) -> tuple[_Indices, _Floats, _Floats, _Indices]:
+        """Those pixels whose rays meet a convex body with few faces, their depth, and normals.
 
-        That is several times faster than asking its triangles.
+        Then which of the normals each shows. This is several times faster than asking triangles.
         """
         normals = body.planes[:, :3] @ T_camera_body[:3, :3].T
         offsets = body.planes[:, 3] + normals @ T_camera_body[:3, 3]
-        slopes = normals.astype(np.float32) @ self._rays.take(pixels, axis=0).T
-        depth = np.full(len(pixels), np.inf, np.float32)
-        face = np.zeros(len(pixels), np.intp)
+        slopes = normals.astype(np.float32) @ self._rays.take(pixels, axis=1)
+        depth, face = self.depth[pixels], np.full(len(pixels), -1)
         # The camera sees a face only from the outer side of its plane.
         for seen in np.flatnonzero(offsets < 0):
-            with np.errstate(divide="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore"):
                 z = np.float32(offsets[seen]) / slopes[seen]
-            inside = z > self._camera.near
-            for other in range(len(offsets)):
-                if other != seen:
-                    inside &= slopes[other] * z <= np.float32(offsets[other] + _EDGE)
+                inside = (z > self._camera.near) & (z < depth)
+                for other in range(len(offsets)):
+                    if other != seen:
+                        inside &= slopes[other] * z <= np.float32(offsets[other] + _EDGE)
             depth[inside], face[inside] = z[inside], seen
-        at = np.flatnonzero(depth < self.depth[pixels])
-        return pixels[at], depth[at], normals.astype(np.float32).take(face[at], axis=0)
+        at = np.flatnonzero(face >= 0)
+        return pixels[at], depth[at], normals.astype(np.float32), face[at]
 
     def _around(self, corners: Array) -> _Indices:
         """The pixels where a box may be seen, from its corners `(8, 3)` in `_CORNERS`' order."""
         z = corners[:, 2]
         near = self._camera.near
-        if z.max() <= near or z.min() >= self._camera.far:
-            return _NOTHING
         if z.min() <= near:
             # Where its edges come through the plane before which nothing is seen.
             a, b = corners[_EDGES[:, 0]], corners[_EDGES[:, 1]]
@@ -273,6 +289,8 @@ class _Image:
             a, b = a[through], b[through]
             t = (near - a[:, 2]) / (b[:, 2] - a[:, 2])
             corners = np.concatenate([corners[z > near], a + t[:, None] * (b - a)])
+            if not len(corners):
+                return _NOTHING
         width, height = self._size
         K = self._camera.intrinsics(width, height)
         at = corners[:, :2] / corners[:, 2:] * K[0, 0] + K[:2, 2]
@@ -288,7 +306,10 @@ class _Image:
 
         `to_light (3,)` is the light's direction in the camera's frame.
         """
-        return np.maximum(self.normal @ to_light.astype(np.float32), np.float32(0))
+        facing = np.zeros(len(self.depth), np.float32)
+        for pixels, normals, shown in self.shades:
+            facing[pixels] = (normals @ to_light.astype(np.float32)).take(shown)
+        return np.maximum(facing, np.float32(0))
 
     def hidden(
         self,
@@ -313,8 +334,8 @@ class _Image:
         R[2] = to_light
         boxes = corners @ R.T
         low, high = (e.astype(np.float32) for e in (boxes.min(axis=1), boxes.max(axis=1)))
-        points = self._rays.take(pixels, axis=0) * self.depth[pixels, None]
-        x, y, height = R.astype(np.float32) @ points.T
+        points = self._rays.take(pixels, axis=1) * self.depth[pixels]
+        x, y, height = R.astype(np.float32) @ points
         asked = (x >= low[:, :1]) & (x <= high[:, :1])
         asked &= (y >= low[:, 1:2]) & (y <= high[:, 1:2])
         asked &= height <= high[:, 2:]
@@ -327,8 +348,8 @@ class _Image:
                 T_camera_body = Ts_camera_body[number].astype(np.float32)
                 rotation = T_camera_body[:3, :3]
                 towards = to_light.astype(np.float32) @ rotation
-                starts = points.take(at, axis=0) @ rotation
-                starts += np.float32(_OFF_SURFACE) * towards - T_camera_body[:3, 3] @ rotation
+                offset = np.float32(_OFF_SURFACE) * towards - T_camera_body[:3, 3] @ rotation
+                starts = (rotation.T @ points.take(at, axis=1)).T + offset
                 ends = body.scene.run(
                     starts, np.broadcast_to(towards, starts.shape), query="OCCLUDED"
                 )
@@ -348,8 +369,9 @@ class _Image:
         """
         width, height = self._size
         bright = 255 * (np.float32(light.ambient) + np.float32(light.intensity) * facing)
-        rgb = palette.take(self.colour, axis=0, mode="wrap") * bright[:, None]
-        rgb = np.minimum(rgb + np.float32(0.5), np.float32(255)).astype(np.uint8)
+        channels = palette.T.take(self.colour, axis=1, mode="wrap") * bright
+        channels = np.minimum(channels + np.float32(0.5), np.float32(255)).astype(np.uint8)
+        rgb = np.ascontiguousarray(channels.T)
         nothing = self.colour < 0
         rgb[nothing] = _BACKGROUND
         depth = np.where(nothing, np.float32(0), self.depth)
@@ -360,10 +382,10 @@ class _Image:
 
 @functools.lru_cache(maxsize=8)
 def _rays(fov_y_deg: float, width: int, height: int) -> _Floats:
-    """Directions `(height * width, 3)` through the pixels' centres, 1 m along z."""
+    """Directions `(3, height * width)` through the pixels' centres, 1 m along z."""
     K = CameraSpec("", "world", np.eye(4), fov_y_deg).intrinsics(width, height)
     u, v = np.meshgrid(np.arange(width), np.arange(height))
     x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
+    rays = np.stack([x, y, np.ones_like(x)]).reshape(3, -1).astype(np.float32)
     rays.setflags(write=False)
     return rays

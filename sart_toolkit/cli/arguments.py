@@ -431,6 +431,15 @@ class Augment:
             "where the joints need it."
         ),
     ] = 2.0
+    execution: Annotated[
+        str,
+        arg(
+            metavar="auto|restore|replay|REF",
+            help="How segments are executed: from the demonstration's saved states (restore), or "
+            "on a robot that follows the demonstration to each waypoint (replay); auto: whichever "
+            "backend and demonstration allow.",
+        ),
+    ] = "auto"
     recording: _RECORDING = "reversed"
     source: _SOURCE = "scene"
     sensor: _SENSOR = None
@@ -464,6 +473,11 @@ class Validate:
     """Prove commanded and measured paths of a dataset clear again; check hashes and courses.
 
     Example: sart validate dataset
+
+    Example: sart validate dataset --replay
+
+    With --replay every trajectory is executed to the end of the task besides, commanded at the rate
+    of a policy, and DATASET/replay.json says which reach the goal. That resumes when interrupted.
     """
 
     dataset: Annotated[
@@ -471,6 +485,71 @@ class Validate:
     ]
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
+    backend: _NOTED_BACKEND = None
+    replay: Annotated[bool, arg(help="Also execute every trajectory to the end.")] = False
+    workers: _WORKERS = 1
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Make one dataset of several of the same task, robot and cameras.
+
+    Example: sart merge dataset1 dataset2 --out both
+
+    Each part keeps its settings, so that the whole can be validated. Files are linked where the
+    disk can do that. Interrupted, it resumes when the same command is typed again.
+    """
+
+    datasets: Annotated[
+        Positional[tuple[Path, ...]],
+        arg(
+            metavar="DATASET [DATASET ...]",
+            help="Directories from `sart augment`, `merge` or `split`.",
+            help_behavior_hint="",
+        ),
+    ]
+    out: Annotated[Path, arg(help="Directory to write.")]
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Split:
+    """Make datasets of parts of one: for training and validation, smaller, or by demonstration.
+
+    Example: sart split dataset --out parts --parts train=0.8,validation=0.2
+
+    Example: sart split dataset --out small --n 20
+
+    Example: sart split dataset --out each --by-source
+
+    Of each sphere every part gets its share. Interrupted, it resumes when the same command is typed
+    again.
+    """
+
+    dataset: Annotated[
+        Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment` or `merge`.")
+    ]
+    out: Annotated[
+        Path, arg(help="Directory to write; with --n it is the dataset, otherwise OUT/NAME are.")
+    ]
+    parts: Annotated[
+        str | None,
+        _optional(
+            "NAME=FRACTION,...", "Parts by name, with the fraction of the episodes that each gets."
+        ),
+    ] = None
+    n: Annotated[
+        int | None,
+        _optional("INT", "One part of so many trajectories, the demonstrations among them."),
+    ] = None
+    by_source: Annotated[bool, arg(help="A part for each demonstration.")] = False
+    seed: Annotated[int, arg(help="Seed of which episodes the --parts get.")] = 0
+    overwrite: _OVERWRITE = False
     json: _JSON = False
 
 

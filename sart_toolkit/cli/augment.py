@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
+from collections.abc import Mapping
 from typing import Any
 
 from sart_toolkit import pipeline
@@ -12,7 +14,9 @@ from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
 from sart_toolkit.cli.workers import chosen_workers
+from sart_toolkit.data.dataset import REPLAY
 from sart_toolkit.data.sampling import SamplingConfig
+from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, Mismatch
 
 
@@ -35,6 +39,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
         "strategy": args.strategy,
         "sampling": SamplingConfig(args.distribution, args.rotation_per_metre),
         "duration": args.duration,
+        "execution": args.execution,
         "recording": args.recording,
         "margin": args.margin,
         "slip_tolerance": args.slip_tolerance,
@@ -45,14 +50,50 @@ def augment_verb(args: Augment) -> dict[str, Any]:
         if args.dry_run:
             planned = pipeline.preview(demos, annotations, args.out, progress=progress, **options)
             return {"plan": str(args.out), **dataclasses.asdict(planned)}
-        dataset = pipeline.augment(demos, annotations, args.out, progress=progress, **options)
+        dataset = pipeline.augment(
+            demos,
+            annotations,
+            args.out,
+            progress=progress,
+            ask=_ask if sys.stdin.isatty() else None,
+            **options,
+        )
     return {"dataset": str(args.out), **describe_dataset(dataset)}
+
+
+def _ask(text: str) -> None:
+    """Show a person beside the robot what to do, and wait until it is done."""
+    say(text)
+    input("Press Enter when that is done: ")
 
 
 def validate_verb(args: Validate) -> dict[str, Any]:
     """`sart validate`."""
+    if not args.replay:
+        for flag, given in (
+            ("backend", args.backend is not None),
+            ("workers", args.workers != 1),
+            ("executor", args.executor != "processes"),
+            ("ray-address", args.ray_address is not None),
+            ("overwrite", args.overwrite),
+        ):
+            if given:
+                raise InvalidInput(f"--{flag}: is about executing the trajectories; add --replay")
+    else:
+        check_writable(args.dataset / REPLAY, args.overwrite)
+    replayed = {}
     with ProgressDisplay() as progress:
         found = pipeline.validate(args.dataset, task=args.task, robot=args.robot, progress=progress)
+        if args.replay and not found.problems:
+            replayed = pipeline.replay(
+                args.dataset,
+                task=args.task,
+                robot=args.robot,
+                backend=args.backend,
+                workers=chosen_workers(args),
+                overwrite=args.overwrite,
+                progress=progress,
+            )
     for name, problem in found.problems.items():
         say(f"{name}: {problem}")
     if found.problems:
@@ -66,6 +107,21 @@ def validate_verb(args: Validate) -> dict[str, Any]:
         "least_commanded_clearance_mm": _rounded_down(found.least_commanded_clearance),
         "least_measured_clearance_mm": _rounded_down(found.least_measured_clearance),
         "largest_deviation_mm": math.ceil(1e6 * found.largest_deviation - 1e-6) / 1e3,
+        **(_replay_figures(replayed) if replayed else {}),
+    }
+
+
+def _replay_figures(result: Mapping[str, Any]) -> dict[str, Any]:
+    """What came of executing a dataset's trajectories; each that failed is said."""
+    for row in result["trajectories"]:
+        if row["success"] is False:
+            say(f"{row['name']}: failed: {row['reason']}")
+    return {
+        "succeeded": f"{result['n_success']} of {result['n_judged']}",
+        **{
+            name: result[name]
+            for name in ("failures", "largest_difference_mm", "largest_difference_deg")
+        },
     }
 
 

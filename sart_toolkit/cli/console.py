@@ -18,6 +18,8 @@ _UNITS = {
     "suggest": "waypoint",
     "augment": "trajectory",
     "plan": "segment",
+    "merge": "episode",
+    "split": "episode",
     "validate": "episode",
     "read": "trajectory",
     "train": "step",

@@ -120,9 +120,12 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         "content_hash",
     )
     clearance = dataset.info.get("least_commanded_clearance_m")
-    return {k: dataset.info.get(k) for k in keys} | {
-        "least_commanded_clearance_mm": None if clearance is None else 1e3 * clearance
-    }
+    resets = dataset.info.get("resets")
+    return (
+        {k: dataset.info.get(k) for k in keys}
+        | ({"resets": resets} if resets else {})
+        | {"least_commanded_clearance_mm": None if clearance is None else 1e3 * clearance}
+    )
 
 
 def describe_skill(path: Path) -> dict[str, Any]:

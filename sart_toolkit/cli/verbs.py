@@ -51,6 +51,8 @@ VERBS: Mapping[str, Verb] = {
     "annotate": Verb(arguments.Annotate, "sart_toolkit.cli.annotate:annotate_verb"),
     "augment": Verb(arguments.Augment, "sart_toolkit.cli.augment:augment_verb"),
     "validate": Verb(arguments.Validate, "sart_toolkit.cli.augment:validate_verb"),
+    "merge": Verb(arguments.Merge, "sart_toolkit.cli.combine:merge_verb"),
+    "split": Verb(arguments.Split, "sart_toolkit.cli.combine:split_verb"),
     "train": Verb(arguments.Train, "sart_toolkit.cli.train:train_verb"),
     "evaluate": Verb(arguments.Evaluate, "sart_toolkit.cli.train:evaluate_verb"),
     "report": Verb(arguments.Report, "sart_toolkit.cli.run:report_verb"),
@@ -69,7 +71,7 @@ VERBS: Mapping[str, Verb] = {
 }
 
 # What an interruption leaves of these is resumed by the same command.
-RESUMING = ("run", "annotate", "augment", "train", "evaluate", "benchmark")
+RESUMING = ("run", "annotate", "augment", "merge", "split", "train", "evaluate", "benchmark")
 
 
 def find_verb(words: list[str]) -> tuple[str, list[str]]:

@@ -17,6 +17,8 @@ IN_GRASP_SLIP = 0.005
 # what rests on a table settles by up to 0.08 mm in PyBullet. All proofs leave that much room, and a
 # segment on which one moves farther is rejected.
 BODY_STILLNESS = 0.0001
+# The same on a way out and back, which takes twice as long: in PyBullet bodies creep by 0.02 mm/s.
+OUT_AND_BACK_STILLNESS = 2 * BODY_STILLNESS
 # How far a gripper's opening may be outside of what it was at t* and what is commanded, as a share
 # of its range. Proofs hold for all of it, and a segment on which it leaves that is rejected.
 GRIPPER_TOLERANCE = 0.006

@@ -7,11 +7,11 @@ A directory holds `sources/demoNN/` (each demonstration and its annotation), `ep
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sart_toolkit.data.manifest import Manifest, source_name
+from sart_toolkit.data.manifest import AttemptKey, Manifest, Rejection, source_name
 from sart_toolkit.data.records import Annotation, Demonstration, Episode
 from sart_toolkit.data.schemas import DatasetFile
 from sart_toolkit.data.storage import (
@@ -24,6 +24,8 @@ from sart_toolkit.data.storage import (
 from sart_toolkit.errors import BrokenFile, Mismatch, MissingFile
 
 SUMMARY = "dataset.json"
+# What came of executing the trajectories.
+REPLAY = "replay.json"
 MANIFEST = "manifest.jsonl"
 
 
@@ -34,11 +36,21 @@ class Source:
         path: directory of both.
         demonstration_hash, annotation_hash: the content hashes that they must have; the latter is
             `None` where there is no annotation.
+        number, request: which source it was in the dataset that it was generated in, and what was
+            asked for there.
     """
 
-    def __init__(self, path: Path, demonstration_hash: str, annotation_hash: str | None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        demonstration_hash: str,
+        annotation_hash: str | None,
+        number: int,
+        request: Mapping[str, Any],
+    ) -> None:
         self.path = path
         self.demonstration_hash, self.annotation_hash = demonstration_hash, annotation_hash
+        self.number, self.request = number, request
 
     def __repr__(self) -> str:
         return f"Source({str(self.path)!r})"
@@ -95,6 +107,7 @@ class Dataset:
         info: what `dataset.json` says.
         sources: the demonstrations with their annotations.
         index: what is known of each episode without reading it.
+        rejected: the attempts that gave no episode, and why.
         content_hash: SHA-256 over the hashes of the sources and of the episodes in order.
     """
 
@@ -102,6 +115,7 @@ class Dataset:
         self.path, self.info = path, info
         self.sources = manifest_sources(path, manifest)
         self.index = manifest.index()
+        self.rejected: Mapping[AttemptKey, Rejection] = manifest.rejected
         self.content_hash = manifest.content_hash()
 
     def __repr__(self) -> str:
@@ -134,10 +148,15 @@ class Dataset:
         return episode
 
 
+def count_demonstrations(sources: Sequence[Source]) -> int:
+    """How many different demonstrations sources are of: some may share one."""
+    return len({source.demonstration_hash for source in sources})
+
+
 def manifest_sources(path: Path, manifest: Manifest) -> tuple[Source, ...]:
     """The sources that a manifest lists, in the dataset directory `path`."""
     return tuple(
-        Source(path / "sources" / source_name(i), *hashes)
+        Source(path / "sources" / source_name(i), *hashes, *manifest.origin(i))
         for i, hashes in enumerate(manifest.sources)
     )
 
@@ -147,13 +166,16 @@ def load_dataset(path: Path) -> Dataset:
 
     Raises:
         MissingFile: no such directory, or it holds no dataset.
-        BrokenFile: generation was interrupted (run it again to resume), or a file is damaged.
+        BrokenFile: it was interrupted while it was made (the same command again resumes), or a file
+            is damaged.
     """
     path = Path(path)
     if not path.is_dir():
         raise MissingFile(f"{path}: no such dataset directory; make it with `sart augment`")
     if not (path / SUMMARY).exists() and (path / MANIFEST).exists():
-        raise BrokenFile(f"{path}: generation was interrupted; run `sart augment` again to resume")
+        raise BrokenFile(
+            f"{path}: interrupted while it was made; run the same command again to resume"
+        )
     info = read_json(path / SUMMARY, DatasetFile)
     if not (path / MANIFEST).exists():
         raise MissingFile(f"{path / MANIFEST}: no such file; restore a copy or generate again")

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sart_toolkit.data.records import Episode, digest
-from sart_toolkit.data.schemas import ManifestHead, ManifestRow
+from sart_toolkit.data.schemas import ManifestHead, ManifestOrigin, ManifestRow
 from sart_toolkit.data.storage import SCHEMA_VERSION, check_schema, check_values
 from sart_toolkit.errors import BrokenFile
 
 KEPT = "kept"
+Origin = tuple[int, Mapping[str, Any]]
 
 
 class AttemptKey(NamedTuple):
@@ -67,6 +68,10 @@ class AttemptTally:
         """Count an attempt that was made."""
         self._made[key[:2]].add(key.k)
         self._kept[key[:2]] += kept
+
+    def has(self, key: AttemptKey) -> bool:
+        """Whether an attempt was made."""
+        return key.k in self._made[key[:2]]
 
     def count(self, source: int, sphere: int) -> tuple[int, int]:
         """How many attempts from a sphere were kept so far, and how many were made."""
@@ -122,11 +127,14 @@ class Manifest:
     """What a dataset was asked for, and how its attempts ended.
 
     `sources` has for each demonstration its content hash and its annotation's, `None` without one;
-    `request` is whatever else decides what is generated.
+    `request` is whatever else decides what is generated. A dataset that is made of others has
+    `origins`: for each source the number that it had in the dataset that it was generated in, and
+    that one's request.
     """
 
     sources: tuple[tuple[str, str | None], ...]
     request: Mapping[str, Any]
+    origins: tuple[Origin, ...] = ()
     kept: dict[AttemptKey, EpisodeEntry] = field(default_factory=dict)
     rejected: dict[AttemptKey, Rejection] = field(default_factory=dict)
 
@@ -143,7 +151,17 @@ class Manifest:
         manifest = cls(
             tuple((source.demonstration, source.annotation) for source in found.sources),
             found.request,
+            tuple(
+                (source.origin.number, source.origin.request)
+                for source in found.sources
+                if isinstance(source.origin, ManifestOrigin)
+            ),
         )
+        if len(manifest.origins) not in (0, len(manifest.sources)):
+            raise BrokenFile(
+                f"{path}: some sources have an origin and some have none: a field is missing or "
+                "wrong; restore a copy or make it again"
+            )
         for i, row in enumerate(attempts, 2):
             manifest._add(check_values(row, ManifestRow, f"{path}, line {i}"), f"{path}, line {i}")
         return manifest
@@ -154,10 +172,17 @@ class Manifest:
             "schema_version": SCHEMA_VERSION,
             "sources": [
                 {"demonstration": demonstration, "annotation": annotation}
-                for demonstration, annotation in self.sources
+                | ({"origin": {"number": o[0], "request": dict(o[1])}} if o else {})
+                for (demonstration, annotation), o in zip(
+                    self.sources, self.origins or [None] * len(self.sources), strict=True
+                )
             ],
             "request": dict(self.request),
         }
+
+    def origin(self, source: int) -> Origin:
+        """The number of a source where it was generated, and what was asked for there."""
+        return self.origins[source] if self.origins else (source, self.request)
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Take a row of `kept_row` or `rejected_row` in.

@@ -47,11 +47,20 @@ class AnnotationFile(msgspec.Struct, forbid_unknown_fields=True):
     settings: Values = {}
 
 
+class ManifestOrigin(msgspec.Struct, forbid_unknown_fields=True):
+    """Which number a source had in the dataset that it was generated in, and that one's request."""
+
+    number: Count
+    request: Values
+
+
 class ManifestSource(msgspec.Struct, forbid_unknown_fields=True):
     """A demonstration and its annotation in a manifest, by their hashes."""
 
     demonstration: str
     annotation: str | None
+    # Where the dataset was made of others.
+    origin: ManifestOrigin | UnsetType = UNSET
 
 
 class ManifestHead(msgspec.Struct, forbid_unknown_fields=True):
@@ -103,6 +112,7 @@ class DatasetFile(msgspec.Struct):
     robot: Name | UnsetType = UNSET
     seconds: Seconds | None | UnsetType = UNSET
     simulated_seconds: Seconds | None | UnsetType = UNSET
+    resets: Count | None | UnsetType = UNSET
     config: Values | UnsetType = UNSET
     references: References | UnsetType = UNSET
 

@@ -21,7 +21,6 @@ import shutil
 import stat
 import tempfile
 import typing
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -55,6 +54,8 @@ from sart_toolkit.errors import (
 )
 
 SCHEMA_VERSION = 6
+# Its type information has it as an exception, not as a class of these.
+_IsalError: type[Exception] = isal_zlib.error  # type: ignore[assignment]
 
 # The largest files that are read as JSON, and as lines of JSON.
 MAX_JSON_BYTES = 16 * 2**20
@@ -125,6 +126,25 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(temporary, real)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def link_file(source: Path, target: Path) -> None:
+    """Have a file by another name too, or where the disk can't do that, copied.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    remove(target)
+    with _cannot_write(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(os.path.realpath(source), target)
+            return
+        except OSError:
+            # Across disks, and where a file has as many names as it can have.
+            pass
+    with replacing(target) as temporary:
+        shutil.copyfile(source, temporary)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -313,7 +333,7 @@ def write_json_lines(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
             head = {}
 
 
-def _drop_cut_line(file: io.BufferedRandom) -> None:
+def _drop_cut_line(file: io.BufferedRandom | io.FileIO) -> None:
     """Cut off what a crash left of a last line."""
     end = file.seek(0, os.SEEK_END)
     file.seek(max(0, end - 1))
@@ -471,7 +491,8 @@ class Journal:
         try:
             with _cannot_write(self.path):
                 linked(path).parent.mkdir(parents=True, exist_ok=True)
-                self._file = open(self.path, "ab+")  # noqa: SIM115 - open until `close`
+                # What a full disk refuses must not stay in a buffer and be written later.
+                self._file = open(self.path, "ab+", buffering=0)  # noqa: SIM115 - until `close`
                 _drop_cut_line(self._file)
             try:
                 self.rows = read_json_lines(self.path) if read else []
@@ -482,29 +503,30 @@ class Journal:
             self._lock.close()
             raise
 
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Add one row.
+    def append(self, *rows: Mapping[str, Any]) -> None:
+        """Add rows, all of them or none.
 
         Raises:
             CannotWrite: the disk refuses.
             InvalidInput: a number is NaN or infinite, or a value isn't JSON.
         """
         try:
-            line = _to_line(row)
+            lines = b"".join(map(_to_line, rows))
         except (TypeError, ValueError) as error:
             raise InvalidInput(f"{self.path}: can't be written as JSON: {error}") from error
         with _cannot_write(self.path):
             end = self._file.seek(0, os.SEEK_END)
             try:
-                self._file.write(line)
-                self._file.flush()
+                left = memoryview(lines)
+                while left:
+                    left = left[self._file.write(left) :]
                 os.fsync(self._file.fileno())
             except OSError:
                 # What the disk has no room for must not stand before the next row.
                 with contextlib.suppress(OSError):
                     os.ftruncate(self._file.fileno(), end)
                 raise
-        self.rows.append(dict(row))
+        self.rows += map(dict, rows)
 
     def clear(self) -> None:
         """Drop all rows."""
@@ -689,13 +711,14 @@ def _header_of(path: Path, block: bytes) -> dict[str, Any]:
     return dict(about)
 
 
-def _check_bytes(path: Path, kind: str) -> str:
+def check_bytes(path: Path, kind: str) -> str:
     """The SHA-256 of a file of `kind`, which is what its first block says.
 
     Raises:
+        MissingFile: no such file.
         BrokenFile: it isn't; the file was changed since it was written.
     """
-    with open(path, "rb") as file:
+    with open(_existing(path), "rb") as file:
         block = file.read(_BLOCK)
         about = _header_of(path, block)
         if about.get("kind") != kind:
@@ -715,7 +738,7 @@ def _check_bytes(path: Path, kind: str) -> str:
 def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
     path = _existing(path)
     try:
-        sha256 = _check_bytes(path, kind)
+        sha256 = check_bytes(path, kind)
         if sha256 not in _inspected:
             inspect(path, kind)
             _inspected.add(sha256)
@@ -728,7 +751,7 @@ def _reading(path: Path, kind: str) -> Iterator[h5py.File]:
     # A damaged file may hold anything in place of a group, a number or JSON.
     except (
         OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError,
-        OverflowError, lzma.LZMAError, zlib.error
+        OverflowError, lzma.LZMAError, _IsalError
     ) as error:  # fmt: skip
         raise BrokenFile(
             f"{path}: truncated or not a {kind} file ({error}); restore a copy or make it again"
@@ -763,13 +786,13 @@ def _put_steps(group: h5py.Group, steps: Steps) -> None:
     cameras = group.create_group("cameras")
     for name, camera in steps.cameras.items():
         at = cameras.create_group(name)
-        _put_frames(at, "rgb", camera.rgb)
-        _put_frames(at, "depth", camera.depth)
+        put_frames(at, "rgb", camera.rgb)
+        put_frames(at, "depth", camera.depth)
         at["intrinsics"] = camera.intrinsics
         at["T_frame_camera"] = camera.T_frame_camera
 
 
-def _put_frames(group: h5py.Group, name: str, frames: NDArray[Any]) -> None:
+def put_frames(group: h5py.Group, name: str, frames: NDArray[Any]) -> None:
     """Write images, each in a chunk of its own, so that a step can be read by itself.
 
     They are stored as HDF5's own filters shuffle and DEFLATE would, which every HDF5 library reads;
@@ -791,8 +814,8 @@ def _put_frames(group: h5py.Group, name: str, frames: NDArray[Any]) -> None:
         stored.id.write_direct_chunk((i, *(0 for _ in frame.shape)), packed)
 
 
-def _get_frames(stored: h5py.Dataset) -> NDArray[Any]:
-    """The images that `_put_frames` wrote.
+def get_frames(stored: h5py.Dataset) -> NDArray[Any]:
+    """The images that `put_frames` wrote.
 
     HDF5 itself would unpack whatever a chunk says; here one never takes more than its image.
 
@@ -802,12 +825,15 @@ def _get_frames(stored: h5py.Dataset) -> NDArray[Any]:
     frames = np.empty(stored.shape, stored.dtype)
     for i, frame in enumerate(frames):
         _, packed = stored.id.read_direct_chunk((i, *(0 for _ in frame.shape)))
-        unpacker = zlib.decompressobj()
+        unpacker = isal_zlib.decompressobj()
         shuffled = unpacker.decompress(packed, frame.nbytes + 1)
         if len(shuffled) != frame.nbytes or not unpacker.eof:
             raise ValueError(f"{stored.name}: image {i} unpacks to another size")
-        rows = np.frombuffer(shuffled, np.uint8).reshape(frames.itemsize, -1)
-        frame[...] = np.ascontiguousarray(rows.T).view(frames.dtype).reshape(frame.shape)
+        # All first bytes of the numbers go to their places, then all second ones, and so on.
+        numbers = frame.reshape(-1).view(np.uint8).reshape(-1, frames.itemsize)
+        rows = np.frombuffer(shuffled, np.uint8).reshape(numbers.shape[::-1])
+        for byte, row in enumerate(rows):
+            numbers[:, byte] = row
     return frames
 
 
@@ -816,7 +842,7 @@ def _get_steps(group: h5py.Group, frames: Mapping[str, CameraFrame]) -> Steps:
         name: CameraRecord(
             frame=frame,
             **{
-                part: _get_frames(stored) if part in ("rgb", "depth") else stored[()]
+                part: get_frames(stored) if part in ("rgb", "depth") else stored[()]
                 for part, stored in group["cameras"][name].items()
             },
         )

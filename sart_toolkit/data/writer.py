@@ -14,6 +14,7 @@ from sart_toolkit.data.dataset import (
     MANIFEST,
     SUMMARY,
     Dataset,
+    count_demonstrations,
     load_dataset,
     manifest_sources,
 )
@@ -22,6 +23,7 @@ from sart_toolkit.data.manifest import (
     AttemptTally,
     EpisodeEntry,
     Manifest,
+    Origin,
     Rejection,
     entry_of,
     episode_name,
@@ -32,7 +34,9 @@ from sart_toolkit.data.records import Annotation, Demonstration, Episode, librar
 from sart_toolkit.data.storage import (
     Journal,
     OutputLock,
+    check_bytes,
     check_replaceable,
+    link_file,
     load_episode,
     remove,
     remove_temporary_files,
@@ -83,8 +87,9 @@ def check_sources(sources: Sources) -> None:
 class EpisodeFiles:
     """Writes the episode files of a dataset directory; picklable, so that any process can."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, numbers: Sequence[int]) -> None:
+        """Write to the directory `path`, whose sources had `numbers` where they were generated."""
+        self._path, self._numbers = path, tuple(numbers)
 
     def write(self, episode: Episode) -> EpisodeEntry:
         """What the index is to say of an episode, which is on the disk by then.
@@ -96,12 +101,23 @@ class EpisodeFiles:
         key = AttemptKey(p.source, p.sphere, p.k)
         return entry_of(episode, save_episode(self._path / episode_name(key), episode))
 
+    def take(self, path: Path, entry: EpisodeEntry) -> None:
+        """Have the file of an episode from another dataset, linked if possible.
+
+        Raises:
+            MissingFile, BrokenFile: it isn't there, or was changed since it was written.
+            CannotWrite: the disk refuses.
+        """
+        check_bytes(path, "episode")
+        link_file(path, self._path / entry.name)
+
     def hold(self, entry: EpisodeEntry) -> bool:
         """Whether an episode's file is there and whole, and what the entry says."""
         try:
             episode = load_episode(self._path / entry.name, entry.content_hash)
             # How long the robot moved isn't in the file.
-            said = dataclasses.replace(entry, seconds=None)
+            number = self._numbers[entry.source]
+            said = dataclasses.replace(entry, source=number, seconds=None)
             return entry_of(episode, entry.content_hash) == said
         except SartError:
             return False
@@ -128,6 +144,7 @@ class DatasetWriter:
         sources: Sources,
         request: Mapping[str, Any],
         overwrite: bool = False,
+        origins: Sequence[Origin] = (),
     ) -> None:
         """Open a dataset directory to generate, or resume generating, what is asked for.
 
@@ -136,6 +153,8 @@ class DatasetWriter:
             sources: demonstrations with their annotations.
             request: whatever else decides what is generated, as JSON values.
             overwrite: replace a dataset in `path`.
+            origins: where the dataset is made of others, which number each source had in the one
+                that it was generated in, and that one's request.
 
         Raises:
             InvalidInput, Mismatch: see `check_sources`.
@@ -148,7 +167,7 @@ class DatasetWriter:
         self.path = path = Path(path)
         hashes = tuple((d.content_hash(), a.content_hash() if a else None) for d, a in sources)
         # As JSON gives it back, to be compared.
-        wanted = Manifest(hashes, json.loads(json.dumps(dict(request))))
+        wanted = Manifest(hashes, json.loads(json.dumps(dict(request))), tuple(origins))
         lock = OutputLock(path)
         try:
             if not (path / MANIFEST).exists():
@@ -159,8 +178,8 @@ class DatasetWriter:
         self._journal = Journal(path / MANIFEST, lock, read=not overwrite)
         try:
             self._manifest = self._opened(wanted, overwrite)
-            self.files = EpisodeFiles(path)
             self.sources = manifest_sources(path, self._manifest)
+            self.files = EpisodeFiles(path, [source.number for source in self.sources])
             self.finished = self._checked()
             self.tally = AttemptTally()
             for key in (*self._manifest.kept, *self._manifest.rejected):
@@ -252,14 +271,15 @@ class DatasetWriter:
         """Why the last attempt without an episode gave none."""
         return next(reversed(self._manifest.rejected.values()), None)
 
-    def keep(self, entry: EpisodeEntry) -> None:
-        """Take an episode in whose file is written; it is kept for good when this returns.
+    def keep(self, *entries: EpisodeEntry) -> None:
+        """Take episodes in whose files are written; they are kept for good when this returns.
 
         Raises:
             CannotWrite: the disk refuses.
         """
-        self._append(kept_row(entry))
-        self.tally.add(entry.key, True)
+        self._append(*map(kept_row, entries))
+        for entry in entries:
+            self.tally.add(entry.key, True)
 
     def reject(self, key: AttemptKey, rejection: Rejection) -> None:
         """Note that an attempt gave no episode, and why.
@@ -270,9 +290,10 @@ class DatasetWriter:
         self._append(rejected_row(key, rejection))
         self.tally.add(key, False)
 
-    def _append(self, row: Mapping[str, Any]) -> None:
-        self._journal.append(row)
-        self._manifest.add(row)
+    def _append(self, *rows: Mapping[str, Any]) -> None:
+        self._journal.append(*rows)
+        for row in rows:
+            self._manifest.add(row)
 
     def finish(
         self, info: Mapping[str, Any], spheres: Sequence[SphereShare] | None = None
@@ -290,7 +311,7 @@ class DatasetWriter:
         clearances = [e.clearance for e in manifest.kept.values() if e.clearance is not None]
         summary = {
             **info,
-            "n_trajectories": self.n_kept + len(self.sources),
+            "n_trajectories": self.n_kept + count_demonstrations(self.sources),
             "n_kept": self.n_kept,
             "n_attempted": self.n_kept + self.n_rejected,
             "rejections": self.rejections,

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sart_toolkit.data.dataset import Dataset
+from sart_toolkit.data.dataset import Dataset, count_demonstrations
 from sart_toolkit.data.records import (
     Demonstration,
     Steps,
@@ -236,8 +236,9 @@ def _write(
     progress: Callable[[int, int], None] | None,
 ) -> tuple[dict[str, Tensor], dict[str, object]]:
     """Write the frames' file; the windows' tensors, and what else is to be known of them."""
-    n_trajectories = len(dataset.sources) + len(dataset)
-    n_steps = sum(len(source.demonstration) for source in dataset.sources)
+    n_trajectories = count_demonstrations(dataset.sources) + len(dataset)
+    demonstrations = {s.demonstration_hash: len(s.demonstration) for s in dataset.sources}
+    n_steps = sum(demonstrations.values())
     n_steps += sum(entry.steps for entry in dataset.index)
     check_room(path, n_steps * layout.frame_bytes)
 
@@ -285,18 +286,22 @@ def _trajectories(
 
     Steps are numbered as they are yielded: an episode's are followed by its demonstration's.
     """
-    demonstrations: list[tuple[Demonstration, int, Array]] = []
+    # Sources may share a demonstration, which is learned from once.
+    demonstrations: dict[str, tuple[Demonstration, int, Array]] = {}
     n_yielded = 0
     reference = dataset.sources[0].demonstration.steps
     for source in dataset.sources:
+        if source.demonstration_hash in demonstrations:
+            continue
         demonstration, actions = source.demonstration, source.demonstration.actions
         _check_same_cameras(source.name, demonstration.steps, reference, cameras)
-        demonstrations.append((demonstration, n_yielded, actions))
+        demonstrations[source.demonstration_hash] = demonstration, n_yielded, actions
         yield demonstration.steps, np.arange(0), actions
         n_yielded += len(demonstration)
     for i, episode in enumerate(dataset):
         t_star = episode.provenance.t_star
-        demonstration, first, actions = demonstrations[dataset.index[i].source]
+        source = dataset.sources[dataset.index[i].source]
+        demonstration, first, actions = demonstrations[source.demonstration_hash]
         if not 0 <= t_star < len(demonstration):
             raise Mismatch(
                 f"episode {i} rejoins at step {t_star} of a demonstration of "

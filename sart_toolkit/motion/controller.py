@@ -142,12 +142,22 @@ class ToolController:
         """Joint targets `(steps, n_joints)` of a control period in which the command stays."""
         return self._interpolator.towards(self._q)
 
-    def follow(self, targets: Array, T_world_tool: Array, measured_T_world_tool: Array) -> None:
+    def follow(
+        self,
+        targets: Array,
+        T_world_tool: Array,
+        measured_T_world_tool: Array,
+        sent: Array | None = None,
+    ) -> None:
         """Take the targets `(steps, n)` of a control period of a motion that was planned before.
 
-        `T_world_tool` is the pose that the last of them stands for.
-
         Nothing changes if an error is raised.
+
+        Args:
+            targets: what is commanded.
+            T_world_tool: the pose `(4, 4)` that the last of them stands for.
+            measured_T_world_tool: where the tool is `(4, 4)`, or was when its command was given.
+            sent: the joints `(n,)` that are sent at the end of the period, where they lag behind.
 
         Raises:
             InvalidInput: not a joint configuration, or not a pose.
@@ -156,15 +166,15 @@ class ToolController:
         rows = check_array("targets", targets, (None, len(self._q)))
         measured = check_pose("measured_T_world_tool", measured_T_world_tool)
         T = check_pose("T_world_tool", T_world_tool)
-        if not np.array_equal(self.clamped(T, measured), T):
+        slack = self._allowed_lag(measured, 1)
+        if not np.array_equal(self.clamped(T, measured, slack), T):
             far, turn = distance(measured, T)
             raise MotionRejected(
                 f"tool lags behind: {far * 1e3:.0f} mm and {np.rad2deg(turn):.0f} deg; allow more "
                 "time"
             )
-        self._q, self._T = rows[-1].copy(), T
-        self._slack = np.zeros(2)
-        self._interpolator.reset(self._q)
+        self._q, self._T, self._slack = rows[-1].copy(), T, slack
+        self._interpolator.reset(self._q if sent is None else sent)
 
     def _allowed_lag(self, measured: Array, n: int) -> Array:
         """How much more lead [m], [rad] than usual is allowed, as what is sent lags behind.

@@ -42,7 +42,7 @@ class Motion:
         if time >= self.duration:
             return 1.0
         position, _, _ = self._timing.at_time(max(time, 0.0))
-        return float(np.clip(position[0], 0.0, 1.0))
+        return min(max(float(position[0]), 0.0), 1.0)
 
     def T_world_tool(self, time: float) -> Array:
         """The tool pose `(4, 4)` at a time [s]."""

@@ -19,7 +19,7 @@ from sart_toolkit.augment import STRATEGIES, allocation, engine, get_strategy
 from sart_toolkit.augment.allocation import allocate
 from sart_toolkit.augment.config import ALLOCATIONS, AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration, augment_sources
-from sart_toolkit.augment.executors import Attempt, RestoreExecutor
+from sart_toolkit.augment.executors import Attempt, RestoreExecutor, no_spare
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.validate import validate_dataset
 from sart_toolkit.backends.interface import Contact, KnowsBodies, Resets, SavesStates
@@ -887,7 +887,7 @@ class Backwards(RestoreExecutor):
 
     parallel = False
 
-    def attempts(self, keys):
+    def attempts(self, keys, spare=no_spare):
         return map(self.attempt, reversed(list(keys)))
 
 
@@ -978,7 +978,8 @@ def test_a_demonstration_without_states_is_refused(
     bare = dataclasses.replace(peg_demonstration, states=())
     spheres = dataclasses.replace(peg_annotation, demonstration_hash=bare.content_hash())
     with pytest.raises(Mismatch, match="holds no saved states"):
-        augment_demonstration(bare, spheres, make_peg_backend, tmp_path / "d")
+        config = AugmentConfig(execution="restore")
+        augment_demonstration(bare, spheres, make_peg_backend, tmp_path / "d", config)
     assert not (tmp_path / "d").exists()
 
 
@@ -992,8 +993,9 @@ def test_a_backend_that_cannot_restore_is_refused_and_closed(
     message = "backend 'limited' lacks the ability SavesStates, but segments start from"
     with pytest.raises(MissingCapability, match=message):
         augment_demonstration(
-            peg_demonstration, peg_annotation, lambda: arm, tmp_path / "d", workers=workers
-        )
+            peg_demonstration, peg_annotation, lambda: arm, tmp_path / "d",
+            AugmentConfig(execution="restore"), workers,
+        )  # fmt: skip
     assert closed == [True] and not (tmp_path / "d").exists()
 
 

@@ -11,6 +11,7 @@ import pytest
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.validate import validate_dataset
+from sart_toolkit.data.combine import merge_datasets, split_dataset
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.manifest import Manifest
 from sart_toolkit.data.records import Steps
@@ -57,14 +58,25 @@ def change(path, index=0, **changes):
     save_episode(path / name, changed)
     manifest = path / "manifest.jsonl"
     old, new = episode.content_hash(), changed.content_hash()
-    rows = read_json_lines(manifest)
+    relist(
+        path,
+        [
+            row | ({"content_hash": new} if old in row.values() else {})
+            for row in read_json_lines(manifest)
+        ],
+    )
+    return name
+
+
+def relist(path, rows):
+    """Write other rows to a dataset's manifest, with hashes that fit."""
+    manifest = path / "manifest.jsonl"
     manifest.unlink()
     for row in rows:
-        append_json_line(manifest, row | ({"content_hash": new} if old in row.values() else {}))
+        append_json_line(manifest, row)
     found = Manifest.from_rows(manifest, read_json_lines(manifest))
     hashes = {"content_hash": found.content_hash(), "manifest_hash": found.whole_hash()}
     rewrite(path / "dataset.json", hashes)
-    return name
 
 
 def with_steps(episode, **changes):
@@ -169,7 +181,7 @@ def steps(**changes):
         (stated(tracking_error=0.0003), "commanded path is proved"),
         (stated(tracking_error="none"), "tracking_error: expected a length >= 0 m, got 'none'"),
         (stated(deviation=-0.001), "deviation: expected a length >= 0 m, got -0.001"),
-        (stated(body_stillness=0.0), "proved for bodies that move by other than 0.1 mm"),
+        (stated(body_stillness=0.0), "proved for bodies that move by less than 0.1 mm"),
         (certificate("measured", margin=0.0), "measured path is proved"),
         (certificate("commanded", nonsense=1), "certificate: a field is missing or unknown"),
         (moved_path, r"measured path is (proved|\d+\.\d+ mm off)"),
@@ -212,7 +224,8 @@ def test_an_episode_with_a_step_too_few_is_reported(copy, validate):
 def test_what_is_no_dataset_is_refused(copy, validate, tmp_path):
     with pytest.raises(MissingFile, match="dataset.json: no such file"):
         validate(tmp_path)
-    rewrite(copy / "dataset.json", {"config": None})
+    head, *rows = read_json_lines(copy / "manifest.jsonl")
+    relist(copy, [{**head, "request": {}}, *rows])
     with pytest.raises(BrokenFile, match="'config' is missing or wrong; generate again"):
         validate(copy)
 
@@ -224,3 +237,24 @@ def test_an_annotation_of_another_demonstration_is_refused(copy, validate):
     path.write_text(json.dumps(annotation))
     with pytest.raises(Mismatch, match="isn't the one that the dataset was made from"):
         validate(copy)
+
+
+def test_a_merged_dataset_is_proved_with_each_part_s_own_settings(
+    made, peg_demonstration, peg_annotation, make_peg_backend, validate, tmp_path
+):
+    config = AugmentConfig(n=3, seed=7, duration=1.5, margin=0.0003, strategy="no_orientation")
+    other = augment_demonstration(
+        peg_demonstration, peg_annotation, make_peg_backend, tmp_path / "other", config
+    )
+    merged = merge_datasets([load_dataset(made), other], tmp_path / "merged")
+    found = validate(merged.path)
+    assert found.episodes == 5 and found.problems == {}
+    parts = split_dataset(merged, tmp_path / "parts", {"a": 0.6, "b": 0.4})
+    assert [validate(part.path).problems for part in parts.values()] == [{}, {}]
+    # Held against another part's settings they don't hold.
+    rows = read_json_lines(merged.path / "manifest.jsonl")
+    origins = [source["origin"] for source in rows[0]["sources"]]
+    for source, origin in zip(rows[0]["sources"], origins[::-1], strict=True):
+        source["origin"] = origin
+    relist(merged.path, rows)
+    assert len(validate(merged.path).problems) == 5

@@ -126,6 +126,36 @@ def test_a_dry_run_writes_what_would_be_executed(
     assert "already exists" in error(capsys, *argv, "--out", plan)
 
 
+def test_datasets_merge_split_and_are_trained_on(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--n", 4, "--seed", 1]
+    run(capsys, *argv, "--out", tmp_path / "other")
+    merged = run(capsys, "merge", chain / "data", tmp_path / "other", "--out", tmp_path / "both")
+    assert (merged["n_kept"], merged["n_trajectories"]) == (7, 8)
+    assert run(capsys, "validate", tmp_path / "both")["episodes"] == 7
+    words = ["split", tmp_path / "both", "--out", tmp_path / "parts"]
+    parts = run(capsys, *words, "--parts", "train=0.7,validation=0.3")
+    train, validation = tmp_path / "parts" / "train", tmp_path / "parts" / "validation"
+    assert {name: part["n_kept"] for name, part in parts.items()} == {
+        str(train): 5, str(validation): 2,
+    }  # fmt: skip
+    learned = run(
+        capsys, "train", train, "--out", tmp_path / "skill", "--epochs", 1, "--image-size", 32
+    )
+    assert learned["trajectories"] == 6
+    short = run(capsys, *words[:2], "--out", tmp_path / "short", "--n", 3)
+    assert short[str(tmp_path / "short")]["n_trajectories"] == 3
+    assert len(run(capsys, *words[:2], "--out", tmp_path / "each", "--by-source")) == 2
+    for wrong, message in (
+        ([], "expected one of parts, n and by_source; give just one"),
+        (["--n", 3, "--by-source"], "give just one"),
+        (["--parts", "a=0.5,b"], "such as train=0.8,validation=0.2, got 'b'"),
+        (["--parts", "a=0.5,a=0.1"], "a name is there twice"),
+    ):
+        assert message in error(capsys, *words, *wrong)
+
+
 def test_info_tells_each_kind_of_file(chain: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kinds = {
         "demo.h5": "demonstration",
@@ -184,7 +214,52 @@ def test_validate_proves_a_dataset_again_and_names_what_does_not_hold(
     assert f"{episode.name}: " in said and "truncated" in said
     assert "1 of 4 episodes don't hold; generate them again" in said
     (broken / "dataset.json").unlink()
-    assert "generation was interrupted" in error(capsys, "validate", broken)
+    assert "interrupted while it was made" in error(capsys, "validate", broken)
+
+
+def test_validate_executes_trajectories_to_the_goal_if_it_is_asked_to(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = shutil.copytree(chain / "data", tmp_path / "data")
+    for flag, value in (("--workers", "2"), ("--overwrite", None), ("--backend", "pybullet")):
+        argv = ["validate", data, flag, *([value] if value else [])]
+        assert f"{flag}: is about executing the trajectories; add" in error(capsys, *argv)
+    assert not (data / "replay.json").exists()
+    found = run(capsys, "validate", data, "--replay", "--workers", 2)
+    assert found["succeeded"] == "4 of 4" and found["failures"] == {}
+    assert 0 < found["largest_difference_mm"] < 20
+    assert "replay.json: already exists; add --overwrite" in error(
+        capsys, "validate", data, "--replay"
+    )
+
+
+def test_augment_follows_the_demonstration_if_it_is_asked_to_and_counts_resets(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["augment", chain / "demo.h5", chain / "annotation.json", "--n", 3]
+    options = ["--execution", "replay", "--recording", "return"]
+    found = run(capsys, *argv, "--out", tmp_path / "d", *options)
+    assert (found["n_kept"], found["resets"]) == (2, 1)
+    assert run(capsys, "validate", tmp_path / "d")["episodes"] == 2
+    assert "executor 'rplay': did you mean 'replay'" in error(
+        capsys, *argv, "--out", tmp_path / "e", "--execution", "rplay"
+    )
+
+
+def test_a_person_at_the_terminal_is_told_what_to_do_and_waited_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waited: list[str] = []
+    monkeypatch.setattr("builtins.input", lambda prompt: waited.append(prompt) or "")
+    asked: list[Any] = []
+    monkeypatch.setattr(pipeline, "augment", lambda *_, ask, **__: asked.append(ask))
+    monkeypatch.setattr("sart_toolkit.cli.augment.describe_dataset", lambda _: {})
+    for terminal in (True, False):
+        monkeypatch.setattr(sys.stdin, "isatty", lambda answer=terminal: answer)
+        main(["augment", "demo.h5", "--out", "d"])
+    assert asked[1] is None
+    asked[0]("Put the scene back")
+    assert "Put the scene back" in capsys.readouterr().err and len(waited) == 1
 
 
 def test_radii_are_suggested_from_the_recorded_images_alone(

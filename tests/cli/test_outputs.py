@@ -22,6 +22,9 @@ VERBS = {
     "annotate": "annotate demo.h5 --suggest-all --no-window --out OUT --overwrite",
     "augment": "augment demo.h5 annotation.json --n 4 --out OUT --overwrite",
     "augment --dry-run": "augment demo.h5 annotation.json --dry-run --out OUT --overwrite",
+    "merge": "merge dataset --out OUT --overwrite",
+    "split": "split dataset --n 3 --out OUT --overwrite",
+    "split --parts": "split dataset --parts a=1 --out OUT --overwrite",
     "train": "train dataset --epochs 1 --out OUT --overwrite",
     "evaluate": "evaluate skill --episodes 1 --out OUT --overwrite",
     "report": "report run --out OUT --overwrite",
@@ -34,7 +37,7 @@ VERBS = {
     "benchmark cloud": f"benchmark cloud {CELLS} --overwrite",
     "benchmark skill": f"benchmark skill {CELLS}",
 }
-LOCKED = {"play": "OUT.mp4", "benchmark skill": "OUT/benchmark.json"}
+LOCKED = {"play": "OUT.mp4", "split --parts": "OUT/a", "benchmark skill": "OUT/benchmark.json"}
 
 
 @pytest.fixture(scope="module")

@@ -94,7 +94,9 @@ def test_a_missing_dataset_is_reported(tmp_path):
 
 def test_a_dataset_whose_generation_was_interrupted_is_reported(made):
     (made[0] / "dataset.json").unlink()
-    with pytest.raises(BrokenFile, match="interrupted; run `sart augment` again to resume"):
+    with pytest.raises(
+        BrokenFile, match="interrupted while it was made; run the same command again to resume"
+    ):
         load_dataset(made[0])
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import multiprocessing
+import os
 import pickle
 import subprocess
 import sys
@@ -76,6 +78,38 @@ def test_resumed_after_any_attempt_it_becomes_the_same(carry_out, tmp_path, afte
     assert resumed.info == whole.info
     names = [sorted(p.relative_to(d.path) for p in d.path.rglob("*")) for d in (whole, resumed)]
     assert names[0] == names[1]
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A directory on a disk of 1 MiB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)]
+    if os.geteuid() or subprocess.run(mount, stderr=subprocess.DEVNULL).returncode:
+        pytest.skip("only root can make a small disk, and not in every container")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("pages", [0, 1, 3, 12, 20, 31])
+def test_on_a_full_disk_it_says_so_and_resumes_once_there_is_room(
+    carry_out, small_disk, tmp_path, pages
+):
+    whole = carry_out(tmp_path / "whole")
+    filler = small_disk / "filler"
+    page = os.statvfs(small_disk).f_frsize
+    with contextlib.suppress(OSError), open(filler, "wb", buffering=0) as file:
+        while True:
+            file.write(bytes(page))
+    os.truncate(filler, filler.stat().st_size - pages * page)
+    for _ in range(2):
+        with pytest.raises(CannotWrite, match="No space left on device; nothing was replaced, ma"):
+            carry_out(small_disk / "d")
+    assert len(list((small_disk / "d").rglob("*.h5"))) <= pages
+    filler.unlink()
+    resumed = carry_out(small_disk / "d")
+    assert resumed.content_hash == whole.content_hash and resumed.info == whole.info
 
 
 def test_a_finished_dataset_is_there_at_once(carry_out, source_of, tmp_path):

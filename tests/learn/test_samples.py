@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from sart_toolkit.data.combine import merge_datasets
 from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, UnknownName
 from sart_toolkit.learn.samples import FRAMES, SAMPLES, WindowConfig, open_windows, remove_windows
@@ -297,6 +298,23 @@ def test_each_episode_is_followed_by_its_own_demonstration(two_sources, open_win
     histories = windows.history.tolist()
     assert [21, 3] in histories and [25, 9 + 5] in histories and [9, 9] in histories
     assert [8, 9] not in histories
+
+
+def test_a_demonstration_that_sources_share_is_learned_from_once(
+    make_dataset, open_windows, tmp_path
+):
+    datasets = [make_dataset((3, 5)), make_dataset((4,))]
+    request = {"config": {"seed": 1}}
+    # Told apart by their settings, as parts of a merged dataset are.
+    rows = [d.sources[0] for d in datasets]
+    rows[1].request = request
+    whole = open_windows(merge_datasets(datasets, tmp_path / "both"), 32, 2)
+    alone = [open_windows(dataset, 32, 2) for dataset in datasets]
+    assert whole.n_trajectories == 4 == sum(each.n_trajectories for each in alone) - 1
+    n_demonstration = len(datasets[0].sources[0].demonstration)
+    n_steps = sum(int(each.multiplicity.sum()) for each in alone)
+    assert int(whole.multiplicity.sum()) == n_steps - n_demonstration
+    assert len(whole.gripper) == sum(len(each.gripper) for each in alone) - n_demonstration
 
 
 def test_demonstrations_seen_by_different_cameras_are_refused(two_sources, open_windows):

@@ -72,6 +72,29 @@ def test_the_drawing_benchmark_measures_each_renderer(capsys):
     assert "lid_closing: rays" in err
 
 
+def test_the_planning_benchmark_counts_what_is_proved(capsys):
+    assert bench.main(["plan", "--tasks", "peg_in_hole", "--n", "30", "--repeats", "1"]) == 0
+    out, err = capsys.readouterr()
+    figures = json.loads(out.splitlines()[-1])["figures"]
+    low, high = figures["proved_per_second_range"]["peg_in_hole"]
+    assert 0 < figures["whole_call"]["peg_in_hole"] < high and low <= high
+    assert figures["proved_per_processor_second"]["peg_in_hole"] >= 0.9 * low
+    assert figures["rejections"] == {"peg_in_hole": {}} and "proved/s" in err
+
+
+def test_the_storage_benchmark_compares_codecs_on_real_images(capsys):
+    arguments = "storage --tasks peg_in_hole --backends pybullet --image-size 32 --episodes 1"
+    assert bench.main([*arguments.split(), "--repeats", "1"]) == 0
+    figures = json.loads(capsys.readouterr().out.splitlines()[-1])["figures"]
+    found = figures["peg_in_hole on pybullet"]
+    assert found["rgb"]["raw"]["ratio"] == found["depth"]["raw"]["ratio"] == 1.0
+    assert found["rgb"]["ours"]["ratio"] > found["rgb"]["lzf"]["ratio"] > 1
+    assert found["depth"]["ours"]["ratio"] > 1 and "png_16_bit" not in found["rgb"]
+    assert found["depth"]["png_16_bit"]["ratio"] > found["depth"]["png"]["ratio"]
+    assert all(row["write_us"] > 0 and row["read_us"] > 0 for row in found["depth"].values())
+    assert found["episode"]["write_ms"] > 0 and found["episode"]["kilobytes"] > 1
+
+
 def test_the_dataset_benchmark_measures_programs_of_their_own(capsys):
     assert bench.main(["dataset", "--episodes", "3", "--n", "2", "3", "--image-size", "16"]) == 0
     figures = json.loads(capsys.readouterr().out.splitlines()[-1])["figures"]
