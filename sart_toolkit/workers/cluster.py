@@ -174,7 +174,7 @@ class _Team:
         self._starting: dict[_Answer, Any] = {}
         self._idle: list[_Member] = []
         self._busy: dict[_Answer, tuple[_Member, int]] = {}
-        self._failed_starts = 0
+        self._count, self._failed_starts = count, 0
         for _ in range(count):
             self._start()
 
@@ -189,11 +189,14 @@ class _Team:
         losses: collections.Counter[int] = collections.Counter()
         done: dict[int, _Outcome] = {}
         for i in range(len(wanted)):
-            while i not in done:
+            while True:
                 while waiting and self._idle:
                     member, n = self._idle.pop(), waiting.popleft()
                     self._busy[member.actor.work.remote(pack(wanted[n])).future()] = member, n
-                answer = self._next_answer()
+                # Nobody is to wait for work while results that are there are handed on.
+                answer = self._next_answer(wait=i not in done)
+                if answer is None:
+                    break
                 if answer in self._starting:
                     self._started(answer)
                     continue
@@ -213,19 +216,19 @@ class _Team:
                     waiting.appendleft(n)
             yield done.pop(i).value(self._outputs)
 
-    def _next_answer(self) -> _Answer:
-        """The first answer that a worker has given."""
+    def _next_answer(self, wait: bool) -> _Answer | None:
+        """The next answer of a worker; without waiting, None if there is none yet."""
         asked = [*self._busy, *self._starting]
-        timeout = None if self._busy else _START_SECONDS
+        timeout = (None if self._busy else _START_SECONDS) if wait else 0.0
         # Ray's own ways to wait make a KeyboardInterrupt of whatever a signal's handler raises.
         answered = concurrent.futures.wait(asked, timeout, concurrent.futures.FIRST_COMPLETED).done
-        if not answered:
+        if not answered and wait:
             free = self._ray.available_resources().get("CPU", 0)
             raise SartError(
                 f"no worker has started within {_START_SECONDS:.0f} s, of the cluster's CPUs "
                 f"{free:.0f} are free; see `ray status`"
             )
-        return answered.pop()
+        return next(iter(answered), None)
 
     def _started(self, answer: _Answer) -> None:
         actor = self._starting.pop(answer)
@@ -233,10 +236,11 @@ class _Team:
             node, differing, outcome = answer.result()
         except self._ray.exceptions.RayError as error:
             self._failed_starts += 1
-            if self._failed_starts == _MOST_LOSSES:
+            # A node that is lost takes all that start there with it.
+            if self._failed_starts == _MOST_LOSSES * self._count:
                 raise SartError(
-                    f"{_MOST_LOSSES} workers were lost while they started, last: {_line(error)}; "
-                    "see `ray status` and the logs of the node"
+                    f"{self._failed_starts} workers were lost while they started, last: "
+                    f"{_line(error)}; see `ray status` and the logs of the node"
                 ) from error
             self._start()
             return
