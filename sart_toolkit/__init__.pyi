@@ -214,6 +214,7 @@ from .learn.training import TrainConfig as TrainConfig
 from .learn.training import train as train
 from .pipeline import run as run
 from .pipeline import run_skill as run_skill
+from .pipeline import train_seeds as train_seeds
 from .poses import inverse as inverse
 from .poses import pose as pose
 from .record.devices import DEVICES as DEVICES
@@ -294,3 +295,4 @@ from .tasks import get_task as get_task
 from .tasks.task import Placement as Placement
 from .tasks.task import PlanStep as PlanStep
 from .tasks.task import Task as Task
+from .workers import Workers as Workers

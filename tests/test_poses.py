@@ -223,6 +223,23 @@ def test_every_rigid_transform_passes_unchanged(T):
     np.testing.assert_array_equal(check_poses("Ts", T[None]), T[None])
 
 
+@pytest.mark.parametrize("off", [0.0, 1e-9, 4e-7, 6e-7, 9e-7, 1.1e-6, 1e-3, 1e200, np.nan, np.inf])
+@pytest.mark.parametrize("entry", [(0, 0), (1, 2), (2, 0), (0, 3), (3, 0), (3, 3)])
+def test_one_pose_is_taken_or_refused_as_among_many(off, entry):
+    T = pose([0.1, -0.2, 0.3], [0.4, -0.5, 0.6])
+    T[entry] += off
+
+    def taken(check):
+        try:
+            return np.asarray(check()).reshape(4, 4).tolist() == T.tolist()
+        except InvalidInput:
+            return False
+
+    assert taken(lambda: check_pose("T", T)) == taken(lambda: check_poses("T", T[None]))
+    T[0] *= -1
+    assert not taken(lambda: check_pose("T", T))
+
+
 @pytest.mark.parametrize("shape", [(3, 3), (4,), (), (2, 4, 4)])
 def test_a_pose_of_another_shape_is_refused_with_its_shape(shape):
     with pytest.raises(InvalidInput, match=r"T: expected pose shape \(4, 4\)") as caught:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import collections
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from sart_toolkit.scenes.spec import SceneSpec
 from sart_toolkit.workers import Workers, worker_map
 
 PROVED = "proved"
+_MOST_AT_ONCE, _FEWEST_BATCHES = 16, 32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +64,10 @@ class _Planner:
         self._config, self._tracking_error = config, tracking_error
         self._planners: dict[int, SegmentPlanner] = {}
 
-    def __call__(self, key: AttemptKey) -> _Planned:
+    def __call__(self, keys: Sequence[AttemptKey]) -> list[_Planned]:
+        return [self._planned(key) for key in keys]
+
+    def _planned(self, key: AttemptKey) -> _Planned:
         planner = self._planner(key.source)
         proposal, rng = planner.proposal(key.sphere, key.k)
         found: dict[str, Any] = {
@@ -91,6 +96,12 @@ class _Planner:
 
     def close(self) -> None:
         """Nothing is held."""
+
+
+def _batches(keys: Sequence[AttemptKey]) -> list[Sequence[AttemptKey]]:
+    """Some attempts at once, so that processes don't wait for each other at every one."""
+    size = min(_MOST_AT_ONCE, max(1, len(keys) // _FEWEST_BATCHES))
+    return [keys[i : i + size] for i in range(0, len(keys), size)]
 
 
 def preview_sources(
@@ -155,7 +166,7 @@ def preview_sources(
         made = 0
         with worker_map(make, workers) as run:
             while keys := allocation.missing(tally):
-                for key, outcome, row in run(keys):
+                for key, outcome, row in itertools.chain.from_iterable(run(_batches(keys))):
                     made += 1
                     tally.add(key, outcome == PROVED)
                     if outcome != PROVED:

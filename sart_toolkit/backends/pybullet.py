@@ -68,6 +68,7 @@ _URDF_FLAGS = (
 # pixel away: they are never quite at rest, and what moves with the camera is drawn once.
 _GRIPPER_STEP = 5e-5
 _MOST_FOUND = 32
+_MOST_STATES = 16
 
 
 class _Client:
@@ -139,6 +140,9 @@ class PyBulletBackend(Simulator):
         self._scene_digest = scene_digest(self._model, scene)
         self._targets = PeriodTargets(self._model, rates.physics_per_control)
         self._drawing: _Drawing | None = None
+        # What PyBullet calls the states that it has in memory, by their bytes: it reads a file for
+        # 10 ms, and segments start from few states again and again.
+        self._known_states: dict[bytes, int] = {}
         # The bytes restored last, until something changes: Bullet renumbers contacts each time.
         self._restored: bytes | None = None
 
@@ -403,8 +407,26 @@ class PyBulletBackend(Simulator):
         head, world = unpack_state(
             self.name, state, self.robot.name, self._scene_digest, sorted(self._bodies)
         )
-        # Existing contacts would keep forces that the file doesn't have.
+        # Existing contacts would keep forces that the state doesn't have.
         self._forget_contacts()
+        if state in self._known_states:
+            self._client.restoreState(self._known_states[state])
+        else:
+            self._restore_file(world)
+            if len(self._known_states) >= _MOST_STATES:
+                oldest = next(iter(self._known_states))
+                self._client.removeState(self._known_states.pop(oldest))
+            self._known_states[state] = self._client.saveState()
+        self._targets.take(head)
+        self._time = head["time"]
+        self._touched = {}
+        self._joint_path = []
+        self._still = {}
+        Ts_world_body = self.body_poses()
+        self._still = {b.name: Ts_world_body[b.name] for b in self.scene.bodies if b.mass is None}
+        self._restored = state
+
+    def _restore_file(self, world: bytes) -> None:
         handle, path = tempfile.mkstemp(suffix=".bullet")
         try:
             with os.fdopen(handle, "wb") as file:
@@ -414,14 +436,6 @@ class PyBulletBackend(Simulator):
             raise BrokenFile(f"saved state: PyBullet refuses it ({error})") from error
         finally:
             os.unlink(path)
-        self._targets.take(head)
-        self._time = head["time"]
-        self._touched = {}
-        self._joint_path = []
-        self._still = {}
-        Ts_world_body = self.body_poses()
-        self._still = {b.name: Ts_world_body[b.name] for b in self.scene.bodies if b.mass is None}
-        self._restored = state
 
     def close(self) -> None:
         if self._client is not None:

@@ -192,7 +192,8 @@ class _Image:
 
     Attributes:
         depth: along z [m], the camera's farthest where nothing was hit yet.
-        normal: of the surface, in the camera's frame `(n, 3)`.
+        shades: of each body drawn, its pixels, normals `(k, 3)` in the camera's frame, and which of
+            them each pixel shows.
         colour: place in the palette, -1 where nothing was hit yet.
         body: the number of the body hit.
     """
@@ -202,7 +203,7 @@ class _Image:
         self._rays = _rays(camera.fov_y_deg, *size)
         n = self._rays.shape[1]
         self.depth = np.full(n, camera.far, np.float32)
-        self.normal = np.zeros((n, 3), np.float32)
+        self.shades: list[tuple[_Indices, _Floats, _Indices]] = []
         self.colour = np.full(n, -1, np.int16)
         self.body = np.full(n, -1, np.int16)
 
@@ -210,7 +211,7 @@ class _Image:
         """The same image, to be drawn on alone."""
         made = _Image.__new__(_Image)
         made._camera, made._size, made._rays = self._camera, self._size, self._rays
-        made.depth, made.normal = self.depth.copy(), self.normal.copy()
+        made.depth, made.shades = self.depth.copy(), self.shades.copy()
         made.colour, made.body = self.colour.copy(), self.body.copy()
         return made
 
@@ -220,19 +221,22 @@ class _Image:
         if not len(pixels):
             return
         if len(body.planes):
-            pixels, depth, normal = self._meet(body, T_camera_body, pixels)
-            colour = body.colours[0]
+            pixels, depth, normals, shown = self._meet(body, T_camera_body, pixels)
+            self.colour[pixels] = body.colours[0]
         else:
-            pixels, depth, normal, colour = self._cast(body, T_camera_body, pixels)
+            pixels, depth, triangles, normals, shown = self._cast(body, T_camera_body, pixels)
+            self.colour[pixels] = body.colours[triangles]
         self.depth[pixels] = depth
-        self.normal[pixels] = normal
-        self.colour[pixels] = colour
+        self.shades.append((pixels, normals, shown))
         self.body[pixels] = number
 
     def _cast(
         self, body: _Body, T_camera_body: Array, pixels: _Indices
-    ) -> tuple[_Indices, _Floats, _Floats, _Indices]:
-        """Those pixels whose rays hit a body's triangles, with depth, normal and colour."""
+    ) -> tuple[_Indices, _Floats, _Indices, _Floats, _Indices]:
+        """Those pixels whose rays hit a body's triangles, their depth, and which triangle it is.
+
+        Then normals, and which of them each shows.
+        """
         near = np.float32(self._camera.near)
         R = T_camera_body[:3, :3].astype(np.float32)
         rays = R.T @ self._rays.take(pixels, axis=1)
@@ -241,38 +245,38 @@ class _Image:
         hit = body.scene.run(starts.T, rays.T, self.depth[pixels] - near, output=1)
         at = np.flatnonzero(hit["primID"] >= 0)
         triangle = hit["primID"][at]
-        normal = body.normals.take(triangle, axis=0)
-        if normal.shape[1] == 1:
-            normal = normal[:, 0]
+        if body.normals.shape[1] == 1:
+            normals, shown = body.normals[:, 0], triangle
         else:
             u, v = hit["u"][at, None], hit["v"][at, None]
-            normal = (1 - u - v) * normal[:, 0] + u * normal[:, 1] + v * normal[:, 2]
-            normal /= np.sqrt(np.einsum("ni,ni->n", normal, normal))[:, None]
-        return pixels[at], hit["tfar"][at] + near, normal @ R.T, body.colours[triangle]
+            corners = body.normals.take(triangle, axis=0)
+            normals = (1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
+            normals /= np.sqrt(np.einsum("ni,ni->n", normals, normals))[:, None]
+            shown = np.arange(len(at))
+        return pixels[at], hit["tfar"][at] + near, triangle, normals @ R.T, shown
 
     def _meet(
         self, body: _Body, T_camera_body: Array, pixels: _Indices
-    ) -> tuple[_Indices, _Floats, _Floats]:
-        """The same for a convex body with few faces, whose planes the rays meet.
+    ) -> tuple[_Indices, _Floats, _Floats, _Indices]:
+        """Those pixels whose rays meet a convex body with few faces, their depth, and normals.
 
-        That is several times faster than asking its triangles.
+        Then which of the normals each shows. This is several times faster than asking triangles.
         """
         normals = body.planes[:, :3] @ T_camera_body[:3, :3].T
         offsets = body.planes[:, 3] + normals @ T_camera_body[:3, 3]
         slopes = normals.astype(np.float32) @ self._rays.take(pixels, axis=1)
-        depth = np.full(len(pixels), np.inf, np.float32)
-        face = np.zeros(len(pixels), np.intp)
+        depth, face = self.depth[pixels], np.full(len(pixels), -1)
         # The camera sees a face only from the outer side of its plane.
         for seen in np.flatnonzero(offsets < 0):
-            with np.errstate(divide="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore"):
                 z = np.float32(offsets[seen]) / slopes[seen]
-            inside = z > self._camera.near
-            for other in range(len(offsets)):
-                if other != seen:
-                    inside &= slopes[other] * z <= np.float32(offsets[other] + _EDGE)
+                inside = (z > self._camera.near) & (z < depth)
+                for other in range(len(offsets)):
+                    if other != seen:
+                        inside &= slopes[other] * z <= np.float32(offsets[other] + _EDGE)
             depth[inside], face[inside] = z[inside], seen
-        at = np.flatnonzero(depth < self.depth[pixels])
-        return pixels[at], depth[at], normals.astype(np.float32).take(face[at], axis=0)
+        at = np.flatnonzero(face >= 0)
+        return pixels[at], depth[at], normals.astype(np.float32), face[at]
 
     def _around(self, corners: Array) -> _Indices:
         """The pixels where a box may be seen, from its corners `(8, 3)` in `_CORNERS`' order."""
@@ -302,7 +306,10 @@ class _Image:
 
         `to_light (3,)` is the light's direction in the camera's frame.
         """
-        return np.maximum(self.normal @ to_light.astype(np.float32), np.float32(0))
+        facing = np.zeros(len(self.depth), np.float32)
+        for pixels, normals, shown in self.shades:
+            facing[pixels] = (normals @ to_light.astype(np.float32)).take(shown)
+        return np.maximum(facing, np.float32(0))
 
     def hidden(
         self,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -111,14 +111,24 @@ def library_versions() -> dict[str, str]:
         "ruckig",
         "ompl",
         "pybullet",
+        "embreex",
         "sapien",
         "torch",
         "safetensors",
         "h5py",
     ):
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
+        version = _installed_version(name)
+        if version is not None:
+            versions[name] = version
     return versions
+
+
+@functools.cache
+def _installed_version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def digest(parts: Mapping[str, Any]) -> str:

@@ -39,13 +39,20 @@ class DrawnMesh:
 
 def shape_mesh(shape: Shape) -> DrawnMesh:
     """A shape's mesh in the frame of its body."""
-    if shape.kind == "box":
-        mesh = trimesh.creation.box(shape.size)
-    elif shape.kind == "sphere":
-        mesh = trimesh.creation.icosphere(radius=shape.size[0])
+    mesh = _primitive_mesh(shape.kind, shape.size)
+    return _drawn(mesh, shape.rgba).moved(shape.T_body_shape)
+
+
+# Scenes in other colours have the same shapes.
+@functools.lru_cache(maxsize=256)
+def _primitive_mesh(kind: str, size: tuple[float, ...]) -> trimesh.Trimesh:
+    if kind == "box":
+        mesh = trimesh.creation.box(size)
+    elif kind == "sphere":
+        mesh = trimesh.creation.icosphere(radius=size[0])
     else:
-        mesh = trimesh.creation.cylinder(shape.size[0], shape.size[1], sections=48)
-    return _drawn(creased(mesh), shape.rgba).moved(shape.T_body_shape)
+        mesh = trimesh.creation.cylinder(size[0], size[1], sections=48)
+    return creased(mesh)
 
 
 class RobotVisuals:

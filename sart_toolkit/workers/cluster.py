@@ -69,26 +69,42 @@ def _connected(ray: Any, count: int, address: str | None) -> Iterator[None]:
         yield
         return
     address = address or os.environ.get("RAY_ADDRESS")
-    options = {"log_to_driver": False, "logging_level": logging.ERROR}
     with _handlers_kept():
-        try:
-            if address == "local":
-                raise ConnectionError
-            if address not in (None, "auto"):
-                _check_answers(address)
-            ray.init(address or "auto", **options)
-        except (ConnectionError, RuntimeError, ray.exceptions.RayError) as error:
-            if address not in (None, "local"):
-                raise SartError(
-                    f"ray_address {address!r}: can't join that cluster ({_line(error)}); start one "
-                    "with `ray start --head`, and this command on one of its nodes"
-                ) from error
-            cpus = max(count, os.cpu_count() or 1)
-            ray.init("local", num_cpus=cpus, include_dashboard=False, **options)
+        _join(ray, count, address)
     try:
         yield
     finally:
         ray.shutdown()
+
+
+def _join(ray: Any, count: int, address: str | None) -> None:
+    """Make this process part of the cluster at the address, or of a new one.
+
+    Raises:
+        InvalidInput: it is no address.
+        SartError: there is no such cluster, or none can be started.
+    """
+    options = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if address != "local":
+        try:
+            if address not in (None, "auto"):
+                _check_answers(address)
+            ray.init(address or "auto", **options)
+            return
+        except (ConnectionError, RuntimeError, ray.exceptions.RayError) as error:
+            if address is not None:
+                raise SartError(
+                    f"ray_address {address!r}: can't join that cluster ({_line(error)}); start one "
+                    "with `ray start --head`, and this command on one of its nodes"
+                ) from error
+    cpus = max(count, os.cpu_count() or 1)
+    try:
+        ray.init("local", num_cpus=cpus, include_dashboard=False, **options)
+    except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+        raise SartError(
+            f"no Ray cluster can be started here ({_line(error)}); if it is the path of its "
+            "temporary folder, set RAY_TMPDIR to another"
+        ) from error
 
 
 def _check_answers(address: str) -> None:

@@ -1067,7 +1067,7 @@ def test_a_request_that_is_refused_replaces_nothing_even_if_it_may_overwrite(
             return limited(make_peg_backend())
     else:
         annotation = dataclasses.replace(annotation, demonstration_hash="0" * 64)
-    with pytest.raises(SartError, match="workers|wirst|use another backend|another demonstration"):
+    with pytest.raises(SartError, match="workers|wirst|lacks the ability|another demonstration"):
         augment_demonstration(
             peg_demonstration, annotation, make, out, config, workers, overwrite=True
         )

@@ -565,3 +565,34 @@ def test_a_library_that_does_not_load_leads_to_the_doctor_who_needs_none(
         main(["doctor", "--json"])
     said = json.loads(capsys.readouterr().out)
     assert said["usable"] is False and said["findings"][0]["remedy"] == "install it"
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--workers", "2"], "--workers: a single training takes one process; add --seeds"),
+        (["--executor", "ray"], "--workers: a single training takes one process; add --seeds"),
+        (["--seeds", "0,x"], "--seeds: expected whole numbers separated by commas, got '0,x'"),
+        (["--seeds", "0,1", "--seed", "0"], "--seed: is for a single training"),
+        (["--seeds", "0,0"], "seeds: expected different whole numbers >= 0"),
+        (["--seeds", "0", "--ray-address", "auto"], "ray_address: is for the executor 'ray'"),
+    ],
+)
+def test_flags_of_training_that_do_not_fit_are_refused(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], argv: list[str], message: str
+) -> None:
+    assert message in error(capsys, "train", chain / "data", "--out", tmp_path / "s", *argv)
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_training_for_each_seed_leaves_skills_and_a_table(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["train", chain / "data", "--out", tmp_path / "s", "--seeds", "2,5", "--epochs", 1]
+    argv += ["--image-size", 32, "--device", "cpu"]
+    said = run(capsys, *argv)
+    assert list(said) == ["table", *(str(tmp_path / "s" / f"seed{seed}") for seed in (2, 5))]
+    table = json.loads(Path(said["table"]).read_text())
+    assert [row["seed"] for row in table["skills"]] == [2, 5]
+    assert run(capsys, "info", tmp_path / "s" / "seed5")["kind"] == "skill"
+    assert "already exists" in error(capsys, *argv)

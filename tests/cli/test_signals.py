@@ -42,6 +42,45 @@ def whole_hash(tmp_path_factory: pytest.TempPathFactory) -> str:
     return load_dataset(out).content_hash
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "whom", "code"), [(signal.SIGTERM, "parent", 143), (signal.SIGINT, "all", 130)]
+)
+def test_a_signal_ends_a_cluster_of_the_command_s_own(
+    number: signal.Signals,
+    whom: str,
+    code: int,
+    tmp_path: Path,
+    wait_until: Callable[..., None],
+    whole_hash: str,
+) -> None:
+    pytest.importorskip("ray")
+    out, home = tmp_path / "data", tmp_path / "home"
+    home.mkdir()
+    words = [*SART, *augmenting(out), "--workers", "2", "--executor", "ray"]
+    manifest = out / "manifest.jsonl"
+    with subprocess.Popen(
+        [*words, "--ray-address", "local"],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "HOME": str(home)},
+    ) as process:
+        wait_until(lambda: manifest.exists() and '"kept"' in manifest.read_text(), 120.0)
+        assert len(living(process.pid)) > 3
+        send = os.killpg if whom == "all" else os.kill
+        send(process.pid, number)
+        said = process.communicate(timeout=60)[1]
+    assert process.returncode == code and "Traceback" not in said
+    wait_until(lambda: not living(process.pid), 15.0)
+    (line,) = [line for line in said.splitlines() if "finished parts are kept" in line]
+    assert line.endswith("--workers 2 --executor ray --ray-address local")
+    kept = manifest.read_text()
+    main(augmenting(out))
+    assert manifest.read_text().startswith(kept)
+    assert load_dataset(out).content_hash == whole_hash
+
+
 def augmenting(out: Path) -> list[str]:
     inputs = [str(asset(f"peg_in_hole/{name}")) for name in ("demo.h5", "annotation.json")]
     return ["augment", *inputs, "--out", str(out), "--n", "9"]

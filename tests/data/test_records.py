@@ -509,6 +509,9 @@ def test_library_versions_name_what_is_installed_and_skip_what_is_not(monkeypatc
         raise records.importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(records.importlib.metadata, "version", absent)
+    # Without what it remembers.
+    uncached = records._installed_version.__wrapped__
+    monkeypatch.setattr(records, "_installed_version", uncached)
     assert set(library_versions()) == {"python"}
 
 

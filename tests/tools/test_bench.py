@@ -78,6 +78,7 @@ def test_the_planning_benchmark_counts_what_is_proved(capsys):
     figures = json.loads(out.splitlines()[-1])["figures"]
     low, high = figures["proved_per_second_range"]["peg_in_hole"]
     assert 0 < figures["whole_call"]["peg_in_hole"] < high and low <= high
+    assert figures["proved_per_processor_second"]["peg_in_hole"] >= 0.9 * low
     assert figures["rejections"] == {"peg_in_hole": {}} and "proved/s" in err
 
 

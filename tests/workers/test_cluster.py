@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -242,3 +244,26 @@ def test_where_no_cluster_is_an_error_says_what_to_start(
         worker_map(Deserter, Workers(1, "ray", address)),
     ):
         pass
+
+
+@pytest.mark.slow
+def test_a_cluster_that_can_not_be_started_is_an_error_with_a_remedy(tmp_path: Path) -> None:
+    long = tmp_path / ("a" * 100)
+    long.mkdir()
+    words = [sys.executable, "-c", _ALONE, str(Path(__file__).parent)]
+    environment = {**os.environ, "RAY_TMPDIR": str(long), "HOME": str(tmp_path)}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert "no Ray cluster can be started here (" in last and "set RAY_TMPDIR" in last
+
+
+_ALONE = """
+import sys
+from sart_toolkit.workers import Workers, worker_map
+sys.path.insert(0, sys.argv[1])
+from test_cluster import Deserter
+
+with worker_map(Deserter, Workers(1, "ray", "local")) as run:
+    print(list(run(["a"])))
+"""
