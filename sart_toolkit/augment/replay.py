@@ -117,7 +117,7 @@ class ReplayExecutor(SegmentExecutor):
             raise MissingCapability(
                 f"backend {backend.name!r} lacks the ability Resets, and nobody can be asked to "
                 "put the scene back to the demonstration's start; type the command at a terminal, "
-                "or pass `ask`"
+                "pass `ask`, or use another backend"
             )
 
     def attempts(self, keys: Iterable[AttemptKey], spare: Spare = no_spare) -> Iterator[Attempt]:
