@@ -549,7 +549,7 @@ def augment(
     return augment_sources(
         sources, make, out, config, workers, overwrite,
         lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
-        ask,
+        ask, task_of(first, task),
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from sart_toolkit.data.manifest import AttemptKey, EpisodeEntry, Rejection
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.writer import DatasetWriter, EpisodeFiles, SphereShare, check_sources
 from sart_toolkit.errors import InvalidInput
+from sart_toolkit.tasks.task import Task
 from sart_toolkit.workers import Workers, worker_map
 from sart_toolkit.workers.parcels import Output
 
@@ -49,6 +50,7 @@ class _Worker:
         out: Output,
         config: AugmentConfig,
         ask: Callable[[str], None] | None,
+        task: Task | None,
     ) -> None:
         numbers = [source.number for source in sources]
         self._out, self._files = out.path, EpisodeFiles(out.path, numbers)
@@ -56,7 +58,7 @@ class _Worker:
         pairs = [(source.demonstration, source.annotation) for source in sources]
         demonstrations = [source.demonstration for source in sources]
         executor = get_executor(config.execution, self._backend, demonstrations)
-        self._executor = executor(self._backend, pairs, config, ask)
+        self._executor = executor(self._backend, pairs, config, ask, task)
 
     def results(self, keys: Iterable[AttemptKey], spare: Spare = no_spare) -> Iterator[_Result]:
         """The results of attempts, one after the other, in the executor's order."""
@@ -87,10 +89,13 @@ def augment_demonstration(
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
     ask: Callable[[str], None] | None = None,
+    task: Task | None = None,
 ) -> Dataset:
     """Generate a dataset directory from one demonstration: `augment_sources` of that alone."""
     sources = [(demonstration, annotation)]
-    return augment_sources(sources, make_backend, out, config, workers, overwrite, progress, ask)
+    return augment_sources(
+        sources, make_backend, out, config, workers, overwrite, progress, ask, task
+    )
 
 
 def augment_sources(
@@ -102,6 +107,7 @@ def augment_sources(
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
     ask: Callable[[str], None] | None = None,
+    task: Task | None = None,
 ) -> Dataset:
     """Generate a dataset directory from demonstrations of one task and their annotations.
 
@@ -119,6 +125,9 @@ def augment_sources(
         overwrite: replace what is in `out`.
         progress: called with (kept, wanted, rejected) after each attempt.
         ask: where the robot can't be reset: shows a person what to do, returns when it is done.
+        task: what the demonstrations show. Given, and where states can be restored, trajectories
+            that begin with something grasped are executed to the end and kept if they reach the
+            goal.
 
     Raises:
         Mismatch: an annotation belongs to another demonstration, the demonstrations to different
@@ -146,7 +155,7 @@ def augment_sources(
             )
         if allocation.shares:
             executor.check(backend, demonstrations, config, ask)
-        request = _request(backend, config)
+        request = _request(backend, config, task)
     started = time.perf_counter()
     with DatasetWriter(out, sources, request, overwrite) as writer:
         if writer.finished is not None:
@@ -166,7 +175,7 @@ def augment_sources(
 
         resets = 0
         make_worker = functools.partial(
-            _Worker, make_backend, writer.sources, Output(writer.path), config, ask
+            _Worker, make_backend, writer.sources, Output(writer.path), config, ask, task
         )
         with _results(make_worker, workers) as results:
             while keys := allocation.missing(writer.tally):
@@ -185,10 +194,11 @@ def augment_sources(
         return _finish(writer, sources[0][0], config, allocation.shares, seconds, counted)
 
 
-def _request(backend: Backend, config: AugmentConfig) -> dict[str, Any]:
+def _request(backend: Backend, config: AugmentConfig, task: Task | None) -> dict[str, Any]:
     """What decides the episodes, besides the demonstrations and their annotations."""
     return {
         "backend": backend.name,
+        "judged_by": None if task is None else task.name,
         "image_size": backend.image_size,
         "config": config.to_json(),
     }

@@ -13,8 +13,14 @@ from sart_toolkit.augment.execution import (
     segment_proof,
 )
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
+from sart_toolkit.augment.rehearsal import Rehearsal
 from sart_toolkit.augment.strategies import Proposal
-from sart_toolkit.backends.interface import Backend, SavesStates, require
+from sart_toolkit.backends.interface import (
+    Backend,
+    SavesStates,
+    missing_abilities,
+    require,
+)
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.data.manifest import KEPT, AttemptKey
 from sart_toolkit.data.records import Annotation, Demonstration, Episode, Provenance, Steps
@@ -22,9 +28,11 @@ from sart_toolkit.errors import Mismatch, MotionRejected, Unreachable
 from sart_toolkit.motion.timing import Motion
 from sart_toolkit.poses import Array
 from sart_toolkit.registry import expect_class, resolve
+from sart_toolkit.tasks.task import Task
 
 # Gives a further attempt from the sphere of a source (both numbers), if one is needed.
 Spare = Callable[[int, int], AttemptKey | None]
+
 _FROM_STATES = "segments start from the demonstration's saved states"
 
 
@@ -67,6 +75,7 @@ class SegmentExecutor(abc.ABC):
         sources: Sequence[tuple[Demonstration, Annotation | None]],
         config: AugmentConfig,
         ask: Callable[[str], None] | None = None,
+        task: Task | None = None,
     ) -> None:
         """Make attempts on `backend`, the robot in the demonstrations' scene.
 
@@ -76,6 +85,7 @@ class SegmentExecutor(abc.ABC):
             config: what to generate.
             ask: shows a person what to do beside the robot, and returns when it is done; `None`
                 where nobody is there.
+            task: judges trajectories that can be executed to their end, see `RestoreExecutor`.
         """
         self._backend, self._sources, self._config = backend, sources, config
         self._ask = ask
@@ -189,9 +199,26 @@ def rejected(
 
 
 class RestoreExecutor(SegmentExecutor):
-    """Starts every attempt from the restored state of waypoint t*, at the pose commanded there."""
+    """Starts every attempt from the restored state of waypoint t*, at the pose commanded there.
+
+    What is grasped may slip on the way back, where nobody looks, by more than on the way out. So
+    where there is a task, and the backend knows what it is judged by, a trajectory that begins with
+    something grasped is executed to its end, and rejected if it doesn't reach the goal.
+    """
 
     parallel = True
+
+    def __init__(
+        self,
+        backend: Backend,
+        sources: Sequence[tuple[Demonstration, Annotation | None]],
+        config: AugmentConfig,
+        ask: Callable[[str], None] | None = None,
+        task: Task | None = None,
+    ) -> None:
+        super().__init__(backend, sources, config, ask, task)
+        judged = task is not None and not missing_abilities(backend, task.observes)
+        self._rehearsal = Rehearsal(backend, task) if task is not None and judged else None
 
     @classmethod
     def check(
@@ -247,9 +274,29 @@ class RestoreExecutor(SegmentExecutor):
             episode = self._episode(
                 key, proposal, motion, certificate, run.steps(), run.joint_path, planner.stillness
             )
+            self._rehearse(planner, episode, run, motion)
         except (Unreachable, MotionRejected) as error:
             return rejected(key, error, run)
         return Attempt(key, KEPT, episode, seconds=run.seconds)
+
+    def _rehearse(
+        self, planner: SegmentPlanner, episode: Episode, run: SegmentRun, motion: Motion
+    ) -> None:
+        """Return if a trajectory reaches the goal, where that has to be seen.
+
+        Raises:
+            MotionRejected: it doesn't.
+        """
+        p = episode.provenance
+        if self._rehearsal is None or not (p.merged and planner.world.phases[p.t_star].grasped):
+            return
+        there = p.recording == "reversed"
+        if there:
+            run.rest(motion)
+        found = self._rehearsal(planner, self._config, episode, there)
+        run.periods += round(found["seconds"] * self._backend.rates.control_hz)
+        if not found["success"]:
+            raise MotionRejected(f"executed to its end, {found['kind']}: {found['reason']}")
 
 
 EXECUTORS = {

@@ -33,6 +33,7 @@ from sart_toolkit.motion.timing import Motion, timed
 from sart_toolkit.poses import Array, apply_motion
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
+from sart_toolkit.tasks.task import Task
 
 _log = logging.getLogger(__name__)
 # How often the robot comes to a waypoint before it is given up as one that doesn't reproduce.
@@ -83,8 +84,9 @@ class ReplayExecutor(SegmentExecutor):
         sources: Sequence[tuple[Demonstration, Annotation | None]],
         config: AugmentConfig,
         ask: Callable[[str], None] | None = None,
+        task: Task | None = None,
     ) -> None:
-        super().__init__(backend, sources, config, ask)
+        super().__init__(backend, sources, config, ask, task)
         self._follower: _Follower | None = None
         # How often what was measured at a waypoint didn't agree with the demonstration, and why.
         self._strayed: Counter[tuple[int, int]] = Counter()

@@ -10,19 +10,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sart_toolkit.augment.execution import SegmentRun
 from sart_toolkit.augment.planner import SegmentPlanner, world_of
+from sart_toolkit.augment.rehearsal import Rehearsal
 from sart_toolkit.augment.validate import generated_with
-from sart_toolkit.backends.interface import BackendFactory, SavesStates, require
-from sart_toolkit.collision.phases import BODY_STILLNESS
+from sart_toolkit.backends.interface import BackendFactory
 from sart_toolkit.data.dataset import REPLAY, load_dataset
-from sart_toolkit.data.records import Episode, apply_action, library_versions
+from sart_toolkit.data.records import library_versions
 from sart_toolkit.data.result_log import ResultLog
-from sart_toolkit.errors import MotionRejected, Unreachable
-from sart_toolkit.motion.controller import ToolController
-from sart_toolkit.poses import distance
 from sart_toolkit.tasks.task import Task
 from sart_toolkit.workers import Workers, worker_map
 
@@ -108,18 +102,12 @@ class _Worker:
     """Executes trajectories of a dataset by their numbers."""
 
     def __init__(self, path: Path, task: Task, make_backend: BackendFactory) -> None:
-        self._dataset, self._task = load_dataset(path), task
+        self._dataset = load_dataset(path)
         # What each source was generated with.
         self._configs = generated_with(self._dataset)
         self._backend = make_backend()
         try:
-            for ability in task.observes:
-                require(
-                    self._backend, ability, f"the success of task {task.name!r} is judged by it"
-                )
-            self._restore = require(
-                self._backend, SavesStates, "trajectories start from saved states"
-            ).restore
+            self._rehearsal = Rehearsal(self._backend, task)
         except BaseException:
             self.close()
             raise
@@ -134,24 +122,9 @@ class _Worker:
 
     def __call__(self, index: int) -> dict[str, Any]:
         entry, episode = self._dataset.index[index], self._dataset.episode(index)
-        row = {
-            "index": index,
-            "name": entry.name,
-            "success": None,
-            "kind": None,
-            "reason": None,
-            "segment_mm": None,
-            "largest_mm": None,
-            "largest_deg": None,
-        }
-        merged = episode.provenance.merged
-        try:
-            self._go_to_start(episode, entry.source)
-            row |= self._followed(episode, entry.source)
-        except (Unreachable, MotionRejected) as error:
-            kind = str(error).partition(":")[0]
-            row |= {"success": False if merged else None, "kind": kind, "reason": str(error)}
-        return row
+        row = {"index": index, "name": entry.name}
+        planner, config = self._planner(entry.source), self._configs[entry.source]
+        return row | self._rehearsal(planner, config, episode)
 
     def _planner(self, source: int) -> SegmentPlanner:
         if source not in self._planners:
@@ -159,55 +132,3 @@ class _Worker:
             world = world_of(found.demonstration, self._backend.robot, self._backend.scene, config)
             self._planners[source] = SegmentPlanner(world, found.annotation, config, found.number)
         return self._planners[source]
-
-    def _go_to_start(self, episode: Episode, source: int) -> None:
-        """Bring the robot from the restored state of t* to a rest at the sampled pose."""
-        p = episode.provenance
-        planner = self._planner(source)
-        proposal, rng = planner.proposal(p.sphere, p.k)
-        stillness = float(p.certificate["body_stillness"]) if p.certificate else BODY_STILLNESS
-        motion, _ = planner.plan(proposal, rng, self._backend.tracking_error, stillness)
-        self._restore(planner.world.demonstration.states[p.t_star])
-        run = SegmentRun(self._backend, planner, p.t_star, self._configs[source], stillness)
-        run.settle(planner.approach(p.t_star))
-        run.go_out(motion, record=False)
-        run.rest(motion)
-
-    def _followed(self, episode: Episode, source: int) -> dict[str, Any]:
-        """What came of a trajectory's actions from its start on."""
-        backend, p = self._backend, episode.provenance
-        planner = self._planner(source)
-        demonstration, rates = planner.world.demonstration, backend.rates
-        suffix = demonstration.steps.measured_Ts_world_tool[episode.suffix(demonstration)]
-        recorded = np.concatenate([episode.steps.measured_Ts_world_tool, suffix])
-        controller = ToolController(planner.world.kinematics, rates=rates)
-        controller.reset(
-            episode.steps.commanded_joint_positions[0], episode.steps.commanded_Ts_world_tool[0]
-        )
-        seen = backend.observe()
-        off = [distance(seen.T_world_tool, recorded[0])]
-        reached: list[bool] = []
-        for action, T_recorded in zip(
-            episode.actions(demonstration)[:-1], recorded[1:], strict=True
-        ):
-            desired, gripper = apply_action(controller.commanded_T_world_tool, action)
-            for targets in controller.move(desired, seen.T_world_tool, rates.control_per_record):
-                sent = backend.command(targets, gripper)
-                backend.step()
-            controller.acknowledge(sent.q)
-            seen = backend.observe()
-            off.append(distance(seen.T_world_tool, T_recorded))
-            reached.append(self._task.success(seen))
-        far, turned = np.array(off).T
-        row: dict[str, Any] = {
-            "segment_mm": round(1e3 * float(far[: len(episode)].max()), 4),
-            "largest_mm": round(1e3 * float(far.max()), 4),
-            "largest_deg": round(float(np.rad2deg(turned.max())), 4),
-        }
-        if not p.merged:
-            return row
-        success = self._task.achieved(np.array(reached), rates.record_hz)
-        row["success"] = success
-        if not success:
-            row |= {"kind": "goal not reached", "reason": self._task.failure_reason(seen)}
-        return row

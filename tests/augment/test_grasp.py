@@ -142,6 +142,30 @@ def test_a_try_with_an_object_in_the_grasp_does_not_depend_on_those_before(
     assert again.episode.content_hash() == first.episode.content_hash()
 
 
+@pytest.mark.parametrize("recording", ["reversed", "return"])
+def test_what_does_not_reach_the_goal_with_the_object_in_the_grasp_is_not_kept(
+    backend, task, demo, annotation, grasped_at, monkeypatch, recording
+):
+    """Executed to its end at the rate of a policy; what it takes counts as the robot's time."""
+    config = AugmentConfig(n=8, recording=recording, cameras=())
+    sources = [(demo, annotation)]
+    last = AttemptKey(0, len(annotation.spheres) - 1, 0)
+    unjudged = RestoreExecutor(backend, sources, config).attempt(last)
+    judged = RestoreExecutor(backend, sources, config, task=task)
+    kept = judged.attempt(last)
+    assert kept.outcome == KEPT
+    assert kept.episode.content_hash() == unjudged.episode.content_hash()
+    rest = (len(demo) - kept.episode.provenance.t_star) / demo.rates.record_hz
+    assert kept.seconds > unjudged.seconds + len(kept.episode) / demo.rates.record_hz + rest - 0.2
+    monkeypatch.setattr(type(task), "success", lambda self, seen: False)
+    failed = judged.attempt(last)
+    assert failed.outcome == "executed to its end, goal not reached"
+    assert failed.episode is None and failed.seconds == pytest.approx(kept.seconds)
+    # Before the grasp nothing can slip, and nothing has to be seen.
+    assert not grasped_at[annotation.spheres[0].waypoint]
+    assert judged.attempt(AttemptKey(0, 0, 0)).outcome == KEPT
+
+
 def test_a_segment_on_which_the_grasped_object_hits_the_table_is_rejected(
     backend, model, demo, grasped_at
 ):
