@@ -372,6 +372,10 @@ class Demonstration(Referring):
         Not over who made it, when, with which versions, and where its robot, task and backend are
         found: what was recorded stays the same. Its file has a hash over these, too.
         """
+        return self._content_hash
+
+    @functools.cached_property
+    def _content_hash(self) -> str:
         return digest(
             {
                 **self.steps.content(),
