@@ -626,9 +626,10 @@ def _asked_for(
     strategy = options.get("strategy", "sart")
     check_names(task=task, robot=robot, backend=backend, strategy=strategy)
     demos = [demo] if isinstance(demo, Path) else list(demo)
-    sources = _sources(demos, [annotation] if isinstance(annotation, Path) else annotation)
-    for path, (demonstration, _) in zip(demos, sources, strict=True):
+    read = [load_demonstration(path) for path in demos]
+    for path, demonstration in zip(demos, read, strict=True):
         _check(demonstration, robot_of(demonstration, robot), str(path))
+    sources = _matched(read, [annotation] if isinstance(annotation, Path) else annotation)
     sources = [(noted(d, task, robot, backend), spheres) for d, spheres in sources]
     annotated = [a for _, a in sources if a is not None]
     from sart_toolkit.augment import get_strategy
@@ -652,30 +653,29 @@ def _asked_for(
     return sources, config
 
 
-def _sources(
-    demos: Sequence[Path], annotations: Sequence[Path]
+def _matched(
+    demonstrations: Sequence[Demonstration], annotations: Sequence[Path]
 ) -> list[tuple[Demonstration, Annotation | None]]:
     """Demonstrations, each with the annotation that names it.
 
     Raises:
-        MissingFile, BrokenFile: a file can't be read.
+        MissingFile, BrokenFile: an annotation can't be read.
         Mismatch: an annotation names none of them, or two name one, or a demonstration is there
             twice.
     """
-    read = {path: load_demonstration(path) for path in demos}
-    hashes = {path: demonstration.content_hash() for path, demonstration in read.items()}
-    if len(set(hashes.values())) < len(demos):
+    hashes = [demonstration.content_hash() for demonstration in demonstrations]
+    if len(set(hashes)) < len(hashes):
         raise Mismatch("the same demonstration is given twice; leave one out")
     found: dict[str, Annotation] = {}
     for path in annotations:
         spheres = load_annotation(path)
         if spheres.demonstration_hash in found:
             raise Mismatch(f"{path}: a second annotation of one demonstration; leave one out")
-        if spheres.demonstration_hash not in hashes.values():
+        if spheres.demonstration_hash not in hashes:
             # Says which, and what to do about it.
-            spheres.check_matches(read[demos[0]])
+            spheres.check_matches(demonstrations[0])
         found[spheres.demonstration_hash] = spheres
-    return [(read[path], found.get(hashes[path])) for path in demos]
+    return [(d, found.get(own)) for d, own in zip(demonstrations, hashes, strict=True)]
 
 
 def _check_sensor(source: str | None, sensor: SensorErrors | None) -> None:

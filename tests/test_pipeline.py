@@ -212,7 +212,7 @@ def test_what_cannot_work_is_said_before_anything_is_written(there, tmp_path):
         ({"policy": "compact"}, UnknownName, "did you mean 'compact_mlp'"),
         ({"backend": "my_things.py:Drawer"}, UnknownName, "expected a subclass of Backend"),
         ({"image_size": 8}, InvalidInput, "image_size: expected at least 16 pixels, got 8"),
-        ({"n": 1}, InvalidInput, "n: expected at least 2"),
+        ({"n": 1}, InvalidInput, "at least 1, and fewer than the 1 trajectories, got 1"),
         ({"episodes": 0}, InvalidInput, "episodes: expected at least 1"),
         ({"distribution": "arae"}, UnknownName, "did you mean 'area'"),
     ):

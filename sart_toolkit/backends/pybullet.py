@@ -268,26 +268,33 @@ class PyBulletBackend(Simulator):
         states = c.getJointStates(self._robot, self._arm)
         closed = self.robot.gripper.closed_position
         T_world_tool, Ts_world_body = self._poses()
-        views = {}
         if cameras:
-            linkage = c.getJointStates(self._robot, list(self._gripper.values()))
-            drawing = self._open_drawing()
-            drawing.place(
-                dict(zip(self.robot.arm_joints, (s[0] for s in states), strict=True)),
-                dict(zip(self._gripper, (s[0] for s in linkage), strict=True)),
-                Ts_world_body,
-            )
-            views = {name: drawing.view(self.cameras[name], size) for name in cameras}
+            self._place_drawing()
         return Observation(
             q=np.array([s[0] for s in states]),
             dq=np.array([s[1] for s in states]),
             gripper=c.getJointState(self._robot, self._driver)[0] / closed,
             T_world_tool=T_world_tool,
             time=self._time,
-            cameras=views,
+            cameras={name: self._image(self.cameras[name], *size) for name in cameras},
             Ts_world_body=Ts_world_body,
             joint_path=np.array(self._joint_path),
         )
+
+    def _place_drawing(self) -> None:
+        """Draw robot and scene where they are now."""
+        c = self._client
+        arm = c.getJointStates(self._robot, self._arm)
+        linkage = c.getJointStates(self._robot, list(self._gripper.values()))
+        self._open_drawing().place(
+            dict(zip(self.robot.arm_joints, (s[0] for s in arm), strict=True)),
+            dict(zip(self._gripper, (s[0] for s in linkage), strict=True)),
+            self._poses()[1],
+        )
+
+    def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        """An image of robot and scene where they are drawn."""
+        return self._open_drawing().view(camera, (width, height))
 
     def body_poses(self) -> dict[str, Array]:
         return self._poses()[1]
@@ -314,13 +321,12 @@ class PyBulletBackend(Simulator):
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
         q = self._model.check_limits(state.q)
         self.scene.check_state(state)
-        drawing = self._open_drawing()
-        drawing.place(
+        self._open_drawing().place(
             dict(zip(self.robot.arm_joints, q, strict=True)),
             self.robot.gripper.joint_positions(state.gripper),
             state.Ts_world_body,
         )
-        return drawing.view(camera, check_image_size((width, height)))
+        return self._image(camera, *check_image_size((width, height)))
 
     def _open_drawing(self) -> _Drawing:
         """What draws robot and scene, whose meshes are read when first needed."""
@@ -422,7 +428,7 @@ class PyBulletBackend(Simulator):
         self._touched = {}
         self._joint_path = []
         self._still = {}
-        Ts_world_body = self.body_poses()
+        Ts_world_body = self._poses()[1]
         self._still = {b.name: Ts_world_body[b.name] for b in self.scene.bodies if b.mass is None}
         self._restored = state
 

@@ -112,7 +112,7 @@ def test_a_sphere_that_collides_is_named_when_saved_in_the_list_and_by_augment(
     def engine(*_, **__):
         raise Reached
 
-    monkeypatch.setattr("sart_toolkit.augment.engine.augment_demonstration", engine)
+    monkeypatch.setattr("sart_toolkit.augment.engine.augment_sources", engine)
     with pytest.raises(Reached):
         main(["augment", str(demo), str(out), "--out", str(tmp_path / "d")])
     (warning,) = [r.getMessage() for r in caplog.records if "not proved" in r.getMessage()]

@@ -299,10 +299,12 @@ def test_a_rejection_says_how_far_the_tool_lags_behind(controller, model, lag, m
 
 
 def test_another_lead_may_be_configured_for_what_is_followed(model):
-    controller = ToolController(model, ControllerConfig(max_lead=0.005, max_lead_deg=1.0))
+    config = ControllerConfig(max_lead=0.005, max_lead_deg=1.0)
+    controller = ToolController(model, config)
     T, q = controller.commanded_T_world_tool, controller.commanded_q
     controller.follow(np.atleast_2d(q), T @ pose([0.0049, 0, 0]), T)
     for away in (pose([0.0051, 0, 0]), pose(rotvec=[np.deg2rad(1.1), 0, 0])):
+        controller = ToolController(model, config)
         with pytest.raises(MotionRejected, match="tool lags behind"):
             controller.follow(np.atleast_2d(q), T @ away, T)
 

@@ -7,14 +7,25 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+import pybullet
+from scipy.spatial.transform import Rotation
 
 from sart_toolkit.backends.interface import CameraView, CommandSent, Contact, Observation
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.backends.states import pack_state, unpack_state
-from sart_toolkit.poses import Array
+from sart_toolkit.poses import Array, pose
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.spec import CameraSpec, ImageSize, RobotSpec
 from sart_toolkit.scenes.spec import Joint, SceneSpec, SceneState
+
+
+def _frame_pose(backend: PyBulletBackend, frame: str) -> Array:
+    """Where a frame of the robot, or "world", is."""
+    if frame == "world":
+        return np.eye(4)
+    state = backend._client.getLinkState(backend._robot, backend._links[frame], 0, 1)
+    return pose(state[4], Rotation.from_quat(state[5]).as_rotvec())
+
 
 # --- images -----------------------------------------------------------------------------------
 
@@ -26,9 +37,9 @@ class _SpoiledCamera(PyBulletBackend):
         return spec
 
     def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
+        right = super()._image(camera, width, height)
         view = super()._image(self.spoilt(camera), width, height)
-        T = self._frame_pose(camera.frame) @ camera.T_frame_camera
-        return dataclasses.replace(view, T_world_camera=T)
+        return dataclasses.replace(view, T_world_camera=right.T_world_camera)
 
 
 class CameraOfOpenGL(_SpoiledCamera):
@@ -89,14 +100,14 @@ class CameraPoseOfItsFrame(PyBulletBackend):
 
     def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
         view = super()._image(camera, width, height)
-        return dataclasses.replace(view, T_world_camera=self._frame_pose(camera.frame))
+        return dataclasses.replace(view, T_world_camera=_frame_pose(self, camera.frame))
 
 
 class WristCameraStays(PyBulletBackend):
     """The wrist camera's images are taken from where it is at home."""
 
     def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
-        T_world_camera = self._frame_pose(camera.frame) @ camera.T_frame_camera
+        T_world_camera = _frame_pose(self, camera.frame) @ camera.T_frame_camera
         if camera.frame != "world":
             T = self._model.fk(self.robot.home, camera.frame) @ camera.T_frame_camera
             camera = dataclasses.replace(camera, frame="world", T_frame_camera=T)
@@ -118,6 +129,7 @@ class DrawsThePresent(PyBulletBackend):
     """Draws where everything is now, whatever state it is given."""
 
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
+        self._place_drawing()
         return self._image(camera, width, height)
 
 
@@ -133,6 +145,7 @@ class DrawingResets(PyBulletBackend):
 
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
         self.reset(state)
+        self._place_drawing()
         return self._image(camera, width, height)
 
 
@@ -423,7 +436,7 @@ class HingesWithoutFriction(PyBulletBackend):
         for index, link in self._bodies.values():
             if link >= 0:
                 c.setJointMotorControl2(
-                    index, link, c.VELOCITY_CONTROL, targetVelocity=0.0, force=0.0
+                    index, link, pybullet.VELOCITY_CONTROL, targetVelocity=0.0, force=0.0
                 )
 
 
@@ -509,6 +522,7 @@ class RestoreForgetsBodies(PyBulletBackend):
         super().restore(state)
         for index, where in before.items():
             c.resetBasePositionAndOrientation(index, *where)
+        self._still = {}
 
 
 class RestoreForgetsTargets(PyBulletBackend):
@@ -574,6 +588,11 @@ class NoBodiesAfterAll(PyBulletBackend):
 
     def body_poses(self) -> dict[str, Array]:
         return {}
+
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
+        return dataclasses.replace(super().observe(cameras, image_size), Ts_world_body={})
 
 
 class ForgetsWhatItHolds(PyBulletBackend):
