@@ -27,7 +27,7 @@ def main(out: Path, n: int = 40, epochs: int = 60, rollouts: int = 20) -> None:
     world = sart.ExactWorld(demo, robot, task.scene)
     annotation = sart.suggest_annotation(demo, world)
     dataset = sart.augment_demonstration(
-        demo, annotation, make_backend, out / "dataset", sart.AugmentConfig(n=n)
+        demo, annotation, make_backend, out / "dataset", sart.AugmentConfig(n=n), task=task
     )
 
     # A policy on the wrist camera, and what it is worth at placements it has not seen.
