@@ -8,24 +8,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pybullet
-from scipy.spatial.transform import Rotation
 
 from sart_toolkit.backends.interface import CameraView, CommandSent, Contact, Observation
 from sart_toolkit.backends.pybullet import PyBulletBackend
 from sart_toolkit.backends.states import pack_state, unpack_state
-from sart_toolkit.poses import Array, pose
+from sart_toolkit.poses import Array, inverse
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.spec import CameraSpec, ImageSize, RobotSpec
 from sart_toolkit.scenes.spec import Joint, SceneSpec, SceneState
-
-
-def _frame_pose(backend: PyBulletBackend, frame: str) -> Array:
-    """Where a frame of the robot, or "world", is."""
-    if frame == "world":
-        return np.eye(4)
-    state = backend._client.getLinkState(backend._robot, backend._links[frame], 0, 1)
-    return pose(state[4], Rotation.from_quat(state[5]).as_rotvec())
-
 
 # --- images -----------------------------------------------------------------------------------
 
@@ -100,19 +90,20 @@ class CameraPoseOfItsFrame(PyBulletBackend):
 
     def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
         view = super()._image(camera, width, height)
-        return dataclasses.replace(view, T_world_camera=_frame_pose(self, camera.frame))
+        T_world_frame = view.T_world_camera @ inverse(camera.T_frame_camera)
+        return dataclasses.replace(view, T_world_camera=T_world_frame)
 
 
 class WristCameraStays(PyBulletBackend):
     """The wrist camera's images are taken from where it is at home."""
 
     def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:
-        T_world_camera = _frame_pose(self, camera.frame) @ camera.T_frame_camera
+        right = super()._image(camera, width, height)
         if camera.frame != "world":
             T = self._model.fk(self.robot.home, camera.frame) @ camera.T_frame_camera
             camera = dataclasses.replace(camera, frame="world", T_frame_camera=T)
         view = super()._image(camera, width, height)
-        return dataclasses.replace(view, T_world_camera=T_world_camera)
+        return dataclasses.replace(view, T_world_camera=right.T_world_camera)
 
 
 class ImagesStretched(PyBulletBackend):
@@ -600,6 +591,12 @@ class ForgetsWhatItHolds(PyBulletBackend):
 
     def body_poses(self) -> dict[str, Array]:
         return {name: T for name, T in super().body_poses().items() if name != "stick"}
+
+    def observe(
+        self, cameras: Sequence[str] = (), image_size: ImageSize | None = None
+    ) -> Observation:
+        seen = super().observe(cameras, image_size)
+        return dataclasses.replace(seen, Ts_world_body=self.body_poses())
 
 
 class SilentlyWithoutImages(PyBulletBackend):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,11 +15,7 @@ def two_nodes() -> Iterator[Any]:
     """The cluster, one CPU each; the driver belongs to the first node."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        # Nobody else may join, and nothing is written in the home folder. Ray reads it when it is
-        # imported.
         patch.setenv("RAY_DEDUP_LOGS_SKIP_REGEX", ".")
-        patch.setenv("RAY_AUTH_MODE", "token")
-        patch.setenv("RAY_AUTH_TOKEN", uuid.uuid4().hex)
         cluster = pytest.importorskip("ray.cluster_utils").Cluster()
         try:
             for _ in range(2):
