@@ -50,7 +50,6 @@ from sart_toolkit.errors import (
     Mismatch,
     MissingFile,
     OutputExists,
-    SartError,
     UnknownName,
 )
 from sart_toolkit.learn.policies import POLICIES
@@ -388,35 +387,35 @@ def record_several(
         InvalidInput: `count` is not positive, or as `record`.
         UnknownName, Mismatch, CannotWrite: as `record`; an operator that doesn't reach the goal has
             three attempts.
-        OutputExists: a file there holds something else.
+        OutputExists: a file there holds a demonstration of another task or seed.
     """
     if count < 1:
         raise InvalidInput(f"count: expected at least 1, got {count}")
+    name = get_task(task).name
     found = []
     for i in range(count):
         path = demonstration_path(out, i)
-        for attempt in range(_ATTEMPTS):
-            state = np.random.SeedSequence([seed, i, attempt]).generate_state(1)
-            own = int(state[0])
-            if path.exists() and not overwrite:
-                demonstration = load_demonstration(path)
-                # What a person steered has no seed.
-                if demonstration.seed in (own, None):
-                    break
-                if attempt < _ATTEMPTS - 1:
-                    continue
+        sequences = (np.random.SeedSequence([seed, i, k]) for k in range(_ATTEMPTS))
+        seeds = [int(sequence.generate_state(1)[0]) for sequence in sequences]
+        if path.exists() and not overwrite:
+            demonstration = load_demonstration(path)
+            # What a person steered has no seed.
+            if demonstration.task != name or demonstration.seed not in (None, *seeds):
                 raise OutputExists(
                     f"{path}: holds another demonstration; add --overwrite or choose another --out"
                 )
+            found.append(demonstration)
+            continue
+        for own in seeds:
             try:
-                demonstration = record(
-                    task, path, seed=own, overwrite=overwrite, progress=progress, **options
+                found.append(
+                    record(task, path, seed=own, overwrite=overwrite, progress=progress, **options)
                 )
                 break
-            except Mismatch:
-                if attempt == _ATTEMPTS - 1:
+            except Mismatch as error:
+                if own == seeds[-1]:
                     raise
-        found.append(demonstration)
+                _log.warning("demonstration %d: %s; trying another seed", i, error)
     return found
 
 
@@ -930,7 +929,10 @@ def _training(
     """A dataset that can be learned from, and how."""
     generated = load_dataset(dataset)
     if policy is None:
-        policy = _policy_for(generated)
+        from sart_toolkit.augment.strategies import Strategy
+
+        # One that was made elsewhere notes none.
+        policy = generated.info.get("policy", Strategy.policy)
     check_names(policy=policy)
     from sart_toolkit.record.checks import check_recording
 
@@ -938,17 +940,6 @@ def _training(
         # Its robot's limits were compared when the dataset was made; here it need not be found.
         check_recording(source.demonstration, name=str(source.path))
     return generated, _train_config(policy, options)
-
-
-def _policy_for(dataset: Dataset) -> str:
-    """The policy that the dataset's strategy is for; where it can't be found, any strategy's."""
-    from sart_toolkit.augment import get_strategy
-    from sart_toolkit.augment.strategies import Strategy
-
-    try:
-        return get_strategy(dataset.info["config"]["strategy"]).policy
-    except (LookupError, TypeError, SartError):
-        return Strategy.policy
 
 
 def _train_config(policy: str | type[Policy], options: Mapping[str, Any]) -> TrainConfig:
@@ -1157,7 +1148,7 @@ def run(
     if count > 1:
         demos = [demonstration_path(out / "demos", i) for i in range(count)]
         spheres = [path.with_suffix(".json") for path in demos]
-    if not drawing.draws:
+    if not drawing.annotated:
         spheres = []
 
     def show() -> None:

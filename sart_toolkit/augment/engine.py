@@ -11,6 +11,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sart_toolkit.augment import get_strategy
 from sart_toolkit.augment.allocation import Allocation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.executors import Spare, get_executor, no_spare
@@ -247,6 +248,7 @@ def _finish(
         {
             "task": demonstration.task,
             "robot": demonstration.robot,
+            "policy": get_strategy(config.strategy).policy,
             "seconds": seconds,
             "simulated_seconds": writer.executed_seconds,
             "resets": resets,

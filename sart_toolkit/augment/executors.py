@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -88,7 +89,7 @@ class SegmentExecutor(abc.ABC):
             task: judges trajectories that can be executed to their end, see `RestoreExecutor`.
         """
         self._backend, self._sources, self._config = backend, sources, config
-        self._ask = ask
+        self._ask, self._task = ask, task
         self._planners: dict[int, SegmentPlanner] = {}
 
     @property
@@ -208,17 +209,11 @@ class RestoreExecutor(SegmentExecutor):
 
     parallel = True
 
-    def __init__(
-        self,
-        backend: Backend,
-        sources: Sequence[tuple[Demonstration, Annotation | None]],
-        config: AugmentConfig,
-        ask: Callable[[str], None] | None = None,
-        task: Task | None = None,
-    ) -> None:
-        super().__init__(backend, sources, config, ask, task)
-        judged = task is not None and not missing_abilities(backend, task.observes)
-        self._rehearsal = Rehearsal(backend, task) if task is not None and judged else None
+    @functools.cached_property
+    def _rehearsal(self) -> Rehearsal | None:
+        if self._task is None or missing_abilities(self._backend, self._task.observes):
+            return None
+        return Rehearsal(self._backend, self._task)
 
     @classmethod
     def check(

@@ -163,16 +163,16 @@ def preview_sources(
             "config": config.to_json(),
             "tracking_error": tracking_error,
         }
-        made = 0
+        made = n_rejected = 0
         with worker_map(make, workers) as run:
             while keys := allocation.missing(tally):
                 for key, outcome, row in itertools.chain.from_iterable(run(_batches(keys))):
                     made += 1
                     tally.add(key, outcome == PROVED)
                     if outcome != PROVED:
+                        n_rejected += 1
                         rejected[key[:2]][outcome] += 1
                     if progress is not None:
-                        n_rejected = sum(each.total() for each in rejected.values())
                         progress(made - n_rejected, allocation.wanted, n_rejected)
                     yield row
 
@@ -191,8 +191,11 @@ def preview_sources(
         }
         for share, (proved, attempted) in zip(allocation.shares, counts, strict=True)
     )
-    proved, attempted = (sum(column) for column in zip((0, 0), *counts, strict=True))
     rejections = sum(rejected.values(), collections.Counter())
     return Preview(
-        allocation.wanted, proved, attempted, dict(sorted(rejections.items())), by_sphere
+        allocation.wanted,
+        sum(proved for proved, _ in counts),
+        sum(attempted for _, attempted in counts),
+        dict(sorted(rejections.items())),
+        by_sphere,
     )

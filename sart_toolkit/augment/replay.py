@@ -87,7 +87,6 @@ class ReplayExecutor(SegmentExecutor):
         task: Task | None = None,
     ) -> None:
         super().__init__(backend, sources, config, ask, task)
-        self._follower: _Follower | None = None
         # How often what was measured at a waypoint didn't agree with the demonstration, and why.
         self._strayed: Counter[tuple[int, int]] = Counter()
         self._last_reason: dict[tuple[int, int], str] = {}

@@ -54,12 +54,14 @@ class Strategy(abc.ABC):
     Attributes:
         draws: whether it draws segments at all; a dataset by one that doesn't is its
             demonstrations.
+        annotated: whether it draws from an annotation's spheres.
         plans: whether a segment whose straight line is blocked may bend round obstacles.
         policy: the policy that its datasets are for, if no other is asked for.
         n: trajectories in a dataset, if no other number is asked for.
     """
 
     draws: bool = True
+    annotated: bool = True
     plans: bool = False
     policy: str = "compact_mlp"
     n: int = 40
@@ -191,6 +193,7 @@ class ContactFreeMiles(SphereStrategy):
         radius: of all spheres [m].
     """
 
+    annotated = False
     rejoin: Rejoin = at_key
     radius: float = 0.02
 
@@ -215,6 +218,7 @@ class DemonstrationsOnly(Strategy):
     """
 
     draws = False
+    annotated = False
     policy: str = "compact_mlp"
     n: int = 40
 

@@ -269,7 +269,7 @@ class PyBulletBackend(Simulator):
         closed = self.robot.gripper.closed_position
         T_world_tool, Ts_world_body = self._poses()
         if cameras:
-            self._place_drawing()
+            self._place_drawing([s[0] for s in states], Ts_world_body)
         return Observation(
             q=np.array([s[0] for s in states]),
             dq=np.array([s[1] for s in states]),
@@ -281,15 +281,13 @@ class PyBulletBackend(Simulator):
             joint_path=np.array(self._joint_path),
         )
 
-    def _place_drawing(self) -> None:
-        """Draw robot and scene where they are now."""
-        c = self._client
-        arm = c.getJointStates(self._robot, self._arm)
-        linkage = c.getJointStates(self._robot, list(self._gripper.values()))
+    def _place_drawing(self, q: Sequence[float], Ts_world_body: Mapping[str, Array]) -> None:
+        """Draw robot and scene where they are now: arm joints `q` [rad], and bodies."""
+        linkage = self._client.getJointStates(self._robot, list(self._gripper.values()))
         self._open_drawing().place(
-            dict(zip(self.robot.arm_joints, (s[0] for s in arm), strict=True)),
+            dict(zip(self.robot.arm_joints, q, strict=True)),
             dict(zip(self._gripper, (s[0] for s in linkage), strict=True)),
-            self._poses()[1],
+            Ts_world_body,
         )
 
     def _image(self, camera: CameraSpec, width: int, height: int) -> CameraView:

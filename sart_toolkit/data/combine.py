@@ -245,7 +245,9 @@ def _written(
                         writer.reject(moved, rejection)
         first = picks[0][0].info
         configs = [dict(source.request.get("config", {})) for source in sources]
-        about = {key: first[key] for key in ("task", "robot", "references") if key in first}
+        about = {
+            key: first[key] for key in ("task", "robot", "policy", "references") if key in first
+        }
         if len(entries) and writer.executed_seconds is not None:
             about["simulated_seconds"] = writer.executed_seconds
         return writer.finish(

@@ -110,6 +110,8 @@ class DatasetFile(msgspec.Struct):
     versions: dict[str, str]
     task: Name | UnsetType = UNSET
     robot: Name | UnsetType = UNSET
+    # What it is for, if no other is asked for.
+    policy: Name | UnsetType = UNSET
     seconds: Seconds | None | UnsetType = UNSET
     simulated_seconds: Seconds | None | UnsetType = UNSET
     resets: Count | None | UnsetType = UNSET

@@ -120,7 +120,8 @@ class DrawsThePresent(PyBulletBackend):
     """Draws where everything is now, whatever state it is given."""
 
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
-        self._place_drawing()
+        now = self.observe()
+        self._place_drawing(list(now.q), now.Ts_world_body)
         return self._image(camera, width, height)
 
 
@@ -136,7 +137,8 @@ class DrawingResets(PyBulletBackend):
 
     def draw(self, state: SceneState, camera: CameraSpec, width: int, height: int) -> CameraView:
         self.reset(state)
-        self._place_drawing()
+        now = self.observe()
+        self._place_drawing(list(now.q), now.Ts_world_body)
         return self._image(camera, width, height)
 
 
