@@ -62,6 +62,8 @@ def test_each_is_recorded_at_a_placement_of_its_own_and_kept_when_called_again(f
 def test_another_seed_is_refused_where_others_are(folder):
     with pytest.raises(OutputExists, match="holds another demonstration; add --overwrite"):
         pipeline.record_several("peg_in_hole", folder / "demos", 2, seed=1, image_size=32)
+    with pytest.raises(OutputExists, match="holds another demonstration; add --overwrite"):
+        pipeline.record_several("door_opening", folder / "demos", 2, image_size=32)
     with pytest.raises(InvalidInput, match="count: expected at least 1, got 0"):
         pipeline.record_several("peg_in_hole", folder / "demos", 0)
 
@@ -120,6 +122,8 @@ def test_scenes_that_look_different_are_refused_where_segments_are_seen(folder, 
     [
         (["--strategy", "bc", "--n", 2], "compact_mlp", 2, {"record", "augment", "train"}),
         (["--strategy", "replay"], "replay", 1, {"record", "augment", "train"}),
+        # It has spheres of its own: none are suggested.
+        (["--strategy", "miles", "--n", 4], "compact_mlp", 4, {"record", "augment", "train"}),
         (
             ["--demonstrations", 2, "--n", 5],
             "compact_mlp",
@@ -140,6 +144,7 @@ def test_a_run_records_what_its_strategy_needs(
     assert (tmp_path / "run" / "report.html").exists()
     dataset = sart.load_dataset(tmp_path / "run" / "dataset")
     assert dataset.info["n_trajectories"] == trajectories
+    assert dataset.info["policy"] == policy
     skill = sart.load_skill(tmp_path / "run" / "skill")
     assert skill.config.training.policy == policy
     # Typed again it finds all done.
