@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.backends import make_backend
 from sart_toolkit.backends.interface import Backend, CommandSent, KnowsBodies, Observation
+from sart_toolkit.cli import main
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import Annotation, Demonstration
@@ -64,6 +66,33 @@ def wait_until() -> Callable[..., None]:
             time.sleep(0.05)
 
     return wait
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """Types a `sart` command; the JSON object that it prints."""
+
+    def said(*argv: object) -> Any:
+        capsys.readouterr()
+        main([*map(str, argv), "--json"])
+        return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+
+    return said
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Types a `sart` command that is refused; the one line that it says."""
+
+    def refused(*argv: object) -> str:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as exit_:
+            main([str(word) for word in argv])
+        assert exit_.value.code == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        return line
+
+    return refused
 
 
 class _Limited(Backend):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -78,21 +77,6 @@ def there(made, monkeypatch):
     return made
 
 
-def said(capsys, *argv):
-    capsys.readouterr()
-    main([*map(str, argv), "--json"])
-    return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-
-
-def refused(capsys, *argv):
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as exit_:
-        main([str(word) for word in argv])
-    assert exit_.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line
-
-
 NOTED = {
     "task": "my_things.py:Drawer",
     "robot": "my_things.py:ROBOT",
@@ -111,38 +95,39 @@ def test_each_file_notes_what_it_was_made_with(there):
     assert config["training"]["policy"] == "my_things.py:MyPolicy"
 
 
-def test_later_verbs_find_it_again(there, tmp_path, capsys):
-    assert said(capsys, "validate", "data")["episodes"] == 3
-    result = said(
-        capsys, "evaluate", "skill", "--out", tmp_path / "e.json", "--episodes", 2,
+def test_later_verbs_find_it_again(there, tmp_path, said):
+    assert said("validate", "data")["episodes"] == 3
+    result = said("evaluate", "skill", "--out", tmp_path / "e.json", "--episodes", 2,
         "--workers", 2, "--videos", 0,
     )  # fmt: skip
     assert (result["task"], result["backend"]) == ("drawer", "simulator")
     argv = ["annotate", "demo.h5", "--suggest-all", "--no-window", "--out", tmp_path / "a.json"]
-    assert said(capsys, *argv)["saved"]
+    assert said(*argv)["saved"]
     film = ["play", "demo.h5", "--out", tmp_path / "film.mp4", "--speed", 4]
-    assert said(capsys, *film)["kind"] == "demonstration"
+    assert said(*film)["kind"] == "demonstration"
     again = "augment demo.h5 spheres.json --out data --n 4 --strategy my_things.py:INSIDE"
-    assert said(capsys, *again.split())["n_kept"] == 3
+    assert said(*again.split())["n_kept"] == 3
 
 
-def test_elsewhere_it_says_what_is_missing_and_takes_another(there, tmp_path, monkeypatch, capsys):
+def test_elsewhere_it_says_what_is_missing_and_takes_another(
+    there, tmp_path, monkeypatch, said, refused
+):
     monkeypatch.chdir(tmp_path)
     argv = ["suggest", there / "demo.h5", "--out", tmp_path / "a.json"]
-    line = refused(capsys, *argv)
+    line = refused(*argv)
     assert "robot 'my_things.py:ROBOT': no file my_things.py from" in line
     assert "it is what the recording notes: name another with --robot REF" in line
     mine = there / "my_things.py"
     argv += ["--robot", f"{mine}:ROBOT"]
-    assert "name another with --task REF" in refused(capsys, *argv)
-    assert said(capsys, *argv, "--task", f"{mine}:Drawer")["spheres"]
-    line = refused(capsys, "evaluate", there / "skill", "--out", tmp_path / "e.json")
+    assert "name another with --task REF" in refused(*argv)
+    assert said(*argv, "--task", f"{mine}:Drawer")["spheres"]
+    line = refused("evaluate", there / "skill", "--out", tmp_path / "e.json")
     assert "policy 'my_things.py:MyPolicy': no file my_things.py from" in line
 
 
-def test_what_is_given_in_place_of_the_noted_is_noted_from_then_on(there, tmp_path, capsys):
+def test_what_is_given_in_place_of_the_noted_is_noted_from_then_on(there, tmp_path, said):
     argv = "augment demo.h5 spheres.json --n 2 --task peg_in_hole --out"
-    said(capsys, *argv.split(), tmp_path / "data")
+    said(*argv.split(), tmp_path / "data")
     noted = load_demonstration(tmp_path / "data" / "sources" / "demo00" / "demo.h5").references
     assert noted == {**NOTED, "task": "peg_in_hole"}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -26,21 +25,6 @@ def folder(tmp_path_factory):
         demo = pipeline.demonstration_path(path / "demos", i)
         pipeline.suggest(demo, path / f"spheres{i}.json")
     return path
-
-
-def said(capsys, *argv):
-    capsys.readouterr()
-    main([*map(str, argv), "--json"])
-    return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-
-
-def refused(capsys, *argv):
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as exit_:
-        main([str(word) for word in argv])
-    assert exit_.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line
 
 
 def demos(folder: Path) -> list[Path]:
@@ -68,15 +52,13 @@ def test_another_seed_is_refused_where_others_are(folder):
         pipeline.record_several("peg_in_hole", folder / "demos", 0)
 
 
-def test_each_annotation_finds_its_demonstration_in_whatever_order(folder, tmp_path, capsys):
+def test_each_annotation_finds_its_demonstration_in_whatever_order(folder, tmp_path, said):
     a, b = demos(folder)
     words = ["--n", 6, "--distribution", "area"]
-    first = said(
-        capsys, "augment", a, folder / "spheres0.json", b, folder / "spheres1.json",
+    first = said("augment", a, folder / "spheres0.json", b, folder / "spheres1.json",
         "--out", tmp_path / "x", *words,
     )  # fmt: skip
-    second = said(
-        capsys, "augment", folder / "spheres1.json", folder / "spheres0.json", a, b,
+    second = said("augment", folder / "spheres1.json", folder / "spheres0.json", a, b,
         "--out", tmp_path / "y", *words,
     )  # fmt: skip
     assert first["content_hash"] == second["content_hash"]
@@ -84,24 +66,24 @@ def test_each_annotation_finds_its_demonstration_in_whatever_order(folder, tmp_p
     dataset = sart.load_dataset(tmp_path / "x")
     for source in dataset.sources:
         source.annotation.check_matches(source.demonstration)
-    assert said(capsys, "validate", tmp_path / "x")["episodes"] == 4
+    assert said("validate", tmp_path / "x")["episodes"] == 4
 
 
-def test_files_that_do_not_belong_together_are_refused(folder, tmp_path, capsys):
+def test_files_that_do_not_belong_together_are_refused(folder, tmp_path, refused):
     a, b = demos(folder)
     out = ["--out", tmp_path / "x"]
-    line = refused(capsys, "augment", a, folder / "spheres1.json", *out)
+    line = refused("augment", a, folder / "spheres1.json", *out)
     assert "annotation was made for another demonstration" in line
-    line = refused(capsys, "augment", a, b, folder / "spheres0.json", *out)
+    line = refused("augment", a, b, folder / "spheres0.json", *out)
     assert "the demonstration has none; make one with `sart suggest`" in line
-    line = refused(capsys, "augment", a, a, folder / "spheres0.json", *out)
+    line = refused("augment", a, a, folder / "spheres0.json", *out)
     assert "the same demonstration is given twice" in line
     save_annotation(tmp_path / "again.json", load_annotation(folder / "spheres0.json"))
-    line = refused(capsys, "augment", a, folder / "spheres0.json", tmp_path / "again.json", *out)
+    line = refused("augment", a, folder / "spheres0.json", tmp_path / "again.json", *out)
     assert "a second annotation of one demonstration" in line
-    line = refused(capsys, "augment", folder / "spheres0.json", *out)
+    line = refused("augment", folder / "spheres0.json", *out)
     assert "expected a demonstration, got annotations alone" in line
-    line = refused(capsys, "augment", a, b, *out, "--strategy", "bc", "--n", 3)
+    line = refused("augment", a, b, *out, "--strategy", "bc", "--n", 3)
     assert "so expected the number of demonstrations (2), got 3" in line
     assert not (tmp_path / "x").exists()
 
@@ -132,14 +114,12 @@ def test_scenes_that_look_different_are_refused_where_segments_are_seen(folder, 
         ),
     ],
 )
-def test_a_run_records_what_its_strategy_needs(
-    words, policy, trajectories, stages, tmp_path, capsys
-):
+def test_a_run_records_what_its_strategy_needs(words, policy, trajectories, stages, tmp_path, said):
     command = [
         "run", "peg_in_hole", "--out", tmp_path / "run", "--image-size", 32, "--epochs", 1,
         "--episodes", 1, "--workers", 1, *words,
     ]  # fmt: skip
-    result = said(capsys, *command)
+    result = said(*command)
     assert set(result["stages_seconds"]) == stages | {"evaluate"}
     assert (tmp_path / "run" / "report.html").exists()
     dataset = sart.load_dataset(tmp_path / "run" / "dataset")
@@ -148,7 +128,7 @@ def test_a_run_records_what_its_strategy_needs(
     skill = sart.load_skill(tmp_path / "run" / "skill")
     assert skill.config.training.policy == policy
     # Typed again it finds all done.
-    assert said(capsys, *command)["success"] == result["success"]
+    assert said(*command)["success"] == result["success"]
 
 
 def test_numbers_that_do_not_fit_are_refused_before_anything_is_written(tmp_path):
