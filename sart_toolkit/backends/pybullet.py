@@ -27,6 +27,7 @@ from sart_toolkit.backends.targets import PeriodTargets
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.poses import Array, inverse
+from sart_toolkit.robots.elements import add_joint, rigid_link
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import (
     CameraSpec,
@@ -34,7 +35,6 @@ from sart_toolkit.robots.spec import (
     RobotSpec,
     check_image_size,
 )
-from sart_toolkit.robots.urdf import add_joint, rigid_link
 from sart_toolkit.robots.visuals import RobotVisuals, shape_mesh
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 
@@ -193,7 +193,8 @@ class PyBulletBackend(Simulator):
             c.changeDynamics(self._robot, i, linearDamping=0, angularDamping=0, jointDamping=0)
         self._arm = [joints[name] for name in robot.arm_joints]
         self._gripper = {name: joints[name] for name in robot.gripper.joint_positions(0.0)}
-        self._driver = joints[robot.gripper.driver]
+        driver = robot.gripper.driver
+        self._driver = None if driver is None else joints[driver]
         self._followers = {joints[n]: ratio for n, ratio in robot.gripper.followers.items()}
         self._tool_link = self._links[robot.tool_frame]
         self._forces = [c.getJointInfo(self._robot, j)[10] for j in self._arm]
@@ -266,20 +267,26 @@ class PyBulletBackend(Simulator):
         size = self.image_size if image_size is None else check_image_size(image_size)
         self.check_cameras(cameras)
         states = c.getJointStates(self._robot, self._arm)
-        closed = self.robot.gripper.closed_position
         T_world_tool, Ts_world_body = self._poses()
         if cameras:
             self._place_drawing([s[0] for s in states], Ts_world_body)
         return Observation(
             q=np.array([s[0] for s in states]),
             dq=np.array([s[1] for s in states]),
-            gripper=c.getJointState(self._robot, self._driver)[0] / closed,
+            gripper=self._opening(),
             T_world_tool=T_world_tool,
             time=self._time,
             cameras={name: self._image(self.cameras[name], *size) for name in cameras},
             Ts_world_body=Ts_world_body,
             joint_path=np.array(self._joint_path),
         )
+
+    def _opening(self) -> float:
+        """The gripper's command that its driver is at; without fingers, the one in force."""
+        if self._driver is None:
+            return float(self._targets.last[-1])
+        state = self._client.getJointState(self._robot, self._driver)
+        return self.robot.gripper.command_at(state[0])
 
     def _place_drawing(self, q: Sequence[float], Ts_world_body: Mapping[str, Array]) -> None:
         """Draw robot and scene where they are now: arm joints `q` [rad], and bodies."""
@@ -353,10 +360,11 @@ class PyBulletBackend(Simulator):
                 targetVelocities=zeros,
                 forces=self._forces, positionGains=ones, velocityGains=ones,
             )  # fmt: skip
-            c.setJointMotorControl2(
-                robot, self._driver, p.POSITION_CONTROL, gripper.closed_position * target[n],
-                force=gripper.force, maxVelocity=gripper.speed,
-            )  # fmt: skip
+            if self._driver is not None:
+                c.setJointMotorControl2(
+                    robot, self._driver, p.POSITION_CONTROL, gripper.driver_position(target[n]),
+                    force=gripper.force, maxVelocity=gripper.speed,
+                )  # fmt: skip
             for index, link, joint in self._springs:
                 effort = joint.effort(c.getJointState(index, link)[0])
                 c.setJointMotorControl2(index, link, p.TORQUE_CONTROL, force=effort)

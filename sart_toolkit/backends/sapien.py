@@ -200,13 +200,19 @@ class SapienBackend(Simulator):
         return Observation(
             q=now.q[robot.arm],
             dq=now.dq[robot.arm],
-            gripper=float(now.q[robot.driver]) / self.robot.gripper.closed_position,
+            gripper=self._opening(),
             T_world_tool=robot.frame_pose(self.robot.tool_frame),
             time=self._periods / self.rates.control_hz,
             cameras=self._take([self.cameras[n] for n in cameras], size, Ts_body),
             Ts_world_body=Ts_body,
             joint_path=np.array(self._joint_path),
         )
+
+    def _opening(self) -> float:
+        """The gripper's command that its driver is at; without fingers, the one in force."""
+        if self._robot.driver is None:
+            return float(self._targets.last[-1])
+        return self.robot.gripper.command_at(float(self._now.q[self._robot.driver]))
 
     def body_poses(self) -> dict[str, Array]:
         self._running()
@@ -254,7 +260,7 @@ class SapienBackend(Simulator):
         self._touched = {}
         self._joint_path = []
         for target in self._targets.rows:
-            physics.advance(target[:-1], self.robot.gripper.closed_position * float(target[-1]))
+            physics.advance(target[:-1], self.robot.gripper.driver_position(float(target[-1])))
             self._joint_path.append(physics.arm_positions())
             for pair, (force, penetration) in physics.contacts().items():
                 old = self._touched.get(pair, (0.0, 0.0))
@@ -315,9 +321,9 @@ class _ConvexParts:
         self._frames = {frame.name: i for i, frame in enumerate(self.model.frames)}
         index = {name: j for j, name in enumerate(self.model.names)}
         self.arm = [index[name] - 1 for name in spec.arm_joints]
-        self.driver = index[spec.gripper.driver] - 1
-        ratios = {spec.gripper.driver: 1.0, **spec.gripper.followers}
-        self.linkage = {index[name]: ratio for name, ratio in ratios.items()}
+        driver = spec.gripper.driver
+        self.driver = None if driver is None else index[driver] - 1
+        self.linkage = {index[name]: ratio for name, ratio in spec.gripper.ratios.items()}
         self.parts: dict[int, list[tuple[str, Shape | str, Array]]] = {}
         for item in self.geometry(pin.GeometryType.COLLISION).geometryObjects:
             T = np.array(item.placement.homogeneous)
@@ -342,8 +348,9 @@ class _ConvexParts:
     def q_all(self, q: Array, gripper: float) -> Array:
         """Positions of all joints, from those of the arm and the gripper's in [0, 1]."""
         full = np.array(pin.neutral(self.model))
+        at = self.spec.gripper.driver_position(gripper)
         for joint, ratio in self.linkage.items():
-            full[joint - 1] = self.spec.gripper.closed_position * gripper * ratio
+            full[joint - 1] = at * ratio
         full[self.arm] = q
         return full
 
@@ -433,7 +440,7 @@ class _Physics:
         self._weights = np.zeros(len(self._order))
         for j, ratio in robot.linkage.items():
             self._weights[self._order.index(j - 1)] = ratio / squared
-        self._lead = _LINKAGE_GIVE * gripper.closed_position
+        self._lead = _LINKAGE_GIVE * abs(gripper.closed_position - gripper.open_position)
         self._reach = max(gripper.speed / self._hz, self._lead)
         for joint, _ in self._linkage:
             joint.set_drive_properties(gripper.force / (squared * self._lead), 0.0)

@@ -104,7 +104,8 @@ def certify(
       the chord's unit parameter;
     - twice what the path's deviation from its chord adds, sum_j R_j e_j;
 
-    with R_j the farthest that a point of the body can be from joint j in any configuration. First
+    with R_j the farthest that a point of the body can be from joint j in any configuration, or 1
+    for a joint that slides, which moves it by that and whose share in A is less. First
     d is bounded by spheres, boxes and the cloud's nearest points; coal computes it where that
     doesn't do, and only intervals and pairs still open are bisected.
 
@@ -127,8 +128,8 @@ def certify(
 class _Knots:
     """What is known at some path parameters `s (k,)`, where the joints are at `q (k, n)`.
 
-    `turns`, `moments (k, n, 3)`: the joints' axes, and the velocity of the point at the origin that
-    turning about each gives; `centres`, `axes`, `middles`, `beside`: spheres and boxes of the
+    `turns`, `moments (k, n, 3)`: the joints' angular velocities, and those of the point at the
+    origin, as from `joint_twists`; `centres`, `axes`, `middles`, `beside`: spheres and boxes of the
     parts, as from `Bounds.placed`; `distances (k, p)`: the pairs' by coal, NaN where not computed
     yet.
     """
@@ -153,9 +154,7 @@ class _Knots:
         if not np.isfinite(q).all():
             raise InvalidInput("joint path: has NaN or infinite entries; remove them")
         poses = np.array([placed.joint_poses(each) for each in q])
-        # A joint's axis is its frame's z; turning about it moves the origin by p x z.
-        turns = poses[:, 1:, :3, 2]
-        moments = cross(poses[:, 1:, :3, 3], turns)
+        turns, moments = placed.joint_twists(poses[:, 1:])
         unknown = np.full((len(s), len(placed.pairs)), np.nan)
         return _Knots(s, q, turns, moments, *placed.bounds.placed(poses), unknown)
 

@@ -53,7 +53,9 @@ class Linkage:
         spec = model.spec
         self._arm = {self._model.getJointId(name) for name in spec.arm_joints}
         self._rates = {}
-        for name, rate in spec.gripper.joint_positions(1.0).items():
+        self._open_at = {}
+        closed_at = spec.gripper.joint_positions(1.0)
+        for name, open_at in spec.gripper.joint_positions(0.0).items():
             joint = self._model.getJointId(name)
             kind = self._model.joints[joint].shortname()
             turns = kind.startswith("JointModelR") and self._model.joints[joint].nq == 1
@@ -62,7 +64,8 @@ class Linkage:
                     f"{spec.name}: gripper joint {name!r} neither turns within limits nor slides; "
                     "make it revolute or prismatic"
                 )
-            self._rates[joint] = rate
+            self._open_at[joint] = open_at
+            self._rates[joint] = closed_at[name] - open_at
         frames = {frame.name: i for i, frame in enumerate(self._model.frames)}
         self._frames = [frames[part.body] for part in parts]
         self._chains = [self._chain(frame) for frame in self._frames]
@@ -86,7 +89,7 @@ class Linkage:
         """The poses `(4, 4)` of the frames of parts that the gripper moves, on the arm's joint."""
         q = pin.neutral(self._model)
         for joint, rate in self._rates.items():
-            q[self._model.joints[joint].idx_q] = rate * gripper
+            q[self._model.joints[joint].idx_q] = self._open_at[joint] + rate * gripper
         pin.framesForwardKinematics(self._model, self._data, q)
         poses = {}
         for i, (frame, chain) in enumerate(zip(self._frames, self._chains, strict=True)):
@@ -119,7 +122,7 @@ class Linkage:
             if self._model.joints[joint].shortname().startswith("JointModelP"):
                 slid += rate
                 # A range may go beyond open and closed, by less than this.
-                reach += 2.0 * rate
+                reach += 2.0 * rate + abs(self._open_at.get(joint, 0.0))
             else:
                 bend += rate**2 * reach + 2 * rate * (turned + slid)
                 turned += rate * reach

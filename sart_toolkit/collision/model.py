@@ -31,6 +31,8 @@ Index = NDArray[np.intp]
 _JOINTS_APART = 2
 # coal's own 1e-6 is relative to the distance, and lets normals be off by a milliradian.
 _TOLERANCE = 1e-8
+# No joint is ever so far [m] beyond its limits, by what is left of an error or of a spline.
+_BEYOND = 0.05
 _YZX, _ZXY = [1, 2, 0], [2, 0, 1]
 
 
@@ -68,9 +70,8 @@ class CollisionModel:
         """Read the collision geometry of robot and scene.
 
         Raises:
-            InvalidInput: a body has no shape that collides or is called as a frame of the robot, a
-                joint of the robot doesn't turn about its frame's z axis, or a part of the robot is
-                neither a mesh nor a box, sphere or cylinder.
+            InvalidInput: a body has no shape that collides or is called as a frame of the robot, or
+                a part of the robot is neither a mesh nor a box, sphere or cylinder.
         """
         self.robot = robot
         self.scene = scene
@@ -78,13 +79,6 @@ class CollisionModel:
         self._parts = robot_parts(self.kinematics)
         model = self.kinematics.pinocchio_model
         frames = {frame.name for frame in model.frames}
-        for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
-            # What bounds motions takes a joint's axis to be its frame's z.
-            if joint.shortname() != "JointModelRZ":
-                raise InvalidInput(
-                    f"{robot.name}: joint {name!r} doesn't turn about its own z axis; give its "
-                    'URDF the axis "0 0 1"'
-                )
         for body in scene.bodies:
             if body.name in frames:
                 raise InvalidInput(
@@ -275,6 +269,18 @@ class PlacedModel:
         pin.forwardKinematics(self._model, self._data, q)
         return np.array([T.homogeneous for T in self._data.oMi])
 
+    def joint_twists(self, poses: Array) -> tuple[Array, Array]:
+        """How each arm joint moves what it carries, by its pose `(..., n, 4, 4)` in the world.
+
+        Returns:
+            For a unit of each joint: the angular velocity, and the velocity of the point at the
+            world's origin, `(..., n, 3)` each. A joint turns about its frame's z, which moves the
+            origin by p x z, or slides along it.
+        """
+        z = poses[..., :3, 2]
+        slides = self.kinematics.slides[:, None]
+        return np.where(slides, 0.0, z), np.where(slides, z, cross(poses[..., :3, 3], z))
+
     def _place(self, q: Array) -> None:
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._placements, q)
 
@@ -352,8 +358,8 @@ class PlacedModel:
             return np.zeros(len(q))
         if found.distance + self.slip[pair] < 0:
             length = -length
-        poses = self.joint_poses(q)[1:]
-        moved = cross(poses[:, :3, 2], found.p_a - poses[:, :3, 3]) @ (normal / length)
+        turns, drifts = self.joint_twists(self.joint_poses(q)[1:])
+        moved = (cross(turns, found.p_a) + drifts) @ (normal / length)
         index = np.arange(len(q))
         between = (index >= self.joints[j]) & (index < self.joints[i])
         return np.where(between, moved, 0.0)
@@ -455,7 +461,8 @@ class Bounds:
         radii: `(p,)` of the spheres [m], the pairs' slip among them.
         half: `(p, 3)` half edges of the boxes [m].
         reach: `(p, n)` no point of a pair's first part is ever farther [m] from a joint between it
-            and the second than this; 0 for other joints.
+            and the second than this, or 1 where the joint slides; 0 for other joints. So a joint
+            moves no point by more than this times its own motion.
     """
 
     def __init__(self, model: PlacedModel) -> None:
@@ -538,16 +545,20 @@ def _link_poses(model: RobotModel) -> dict[str, Array]:
 def _axis_distances(model: PlacedModel) -> Array:
     """For each part and joint `(parts, n)`: how far [m] a point of the part can be from the joint.
 
-    That is in any configuration, for the joints that carry the part; 0 for others.
+    That is in any configuration, for the joints that carry the part; 1 if they slide; 0 for others.
     """
-    joints = model.kinematics.pinocchio_model.jointPlacements
+    kinematics = model.kinematics
+    joints = kinematics.pinocchio_model.jointPlacements
+    # How far a joint that slides may take what it carries, with some room beyond its limits.
+    farthest = np.maximum(np.abs(kinematics.lower), np.abs(kinematics.upper)) + _BEYOND
+    slid = np.where(kinematics.slides, farthest, 0.0)
     distances = np.zeros((len(model.parts), len(joints) - 1))
     links = [float(np.linalg.norm(T.translation)) for T in joints]
     for row, part in zip(distances, model.parts, strict=True):
         reach = part.reach
         for j in range(part.joint, 0, -1):
-            row[j - 1] = reach
-            reach += links[j]
+            row[j - 1] = 1.0 if kinematics.slides[j - 1] else reach
+            reach += links[j] + slid[j - 1]
     return distances
 
 

@@ -135,7 +135,7 @@ class ToolController:
         for i in range(n):
             T = goal if i == n - 1 else interpolate(self._T, goal, (i + 1) / n)
             q = goals[i] = self.model.ik(T, q, self.config.max_joint_step)
-        self._q, self._T, self._slack = q.copy(), goal, slack
+        self._q, self._T, self._slack = q.copy(), self.model.reached(goal, q), slack
         return np.stack([self._interpolator.towards(q) for q in goals])
 
     def hold(self) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sart_toolkit.data.records import DEFAULT_RATES
@@ -27,7 +29,8 @@ def straight_line(
 ) -> Motion:
     """The motion of the tool in a straight line, in `duration` or as much longer as joints need.
 
-    The joint path is a quintic spline through inverse-kinematics solutions on the line, as many as
+    An arm of fewer than six joints follows the line's positions and turns the tool as far as it
+    can. The joint path is a quintic spline through inverse-kinematics solutions on the line, as many as
     keep the tool within `deviation` of it between them. See `timed` for its course in time.
 
     Args:
@@ -63,12 +66,15 @@ def straight_line(
         # Next to the path's ends a spline is farthest off nearer to these than half way.
         sampled = np.concatenate([middles, np.array([0.25, 0.35]) / (count - 1)])
         sampled = np.concatenate([sampled, 1 - sampled[-2:]])
+        # An arm of fewer than six joints is held to the positions, and turns as far as it can.
+        errors = 2 if len(q_start) >= 6 else 1
         off = max(
-            max(distance(model.fk(q), T_at(s)))
+            max(distance(model.fk(q), T_at(s))[:errors])
             for q, s in zip(path.positions(sampled), sampled, strict=True)
         )
         if off <= deviation:
-            return timed(model, path, duration, T_at, record_hz)
+            poses = T_at if errors == 2 else _PosesOf(model, path)
+            return timed(model, path, duration, poses, record_hz)
         if 2 * count > _MOST:
             raise MotionRejected(
                 f"joint path: {off * 1e3:.2f} mm off the line with {count} knots, a joint turns "
@@ -95,3 +101,15 @@ def _solutions(
         near = near if i == 0 else np.clip(near, model.lower, model.upper)
         knots[i] = model.ik(T_at(float(s)), near, max_step)
     return knots
+
+
+@dataclass(frozen=True)
+class _PosesOf:
+    """The tool's poses on a joint path."""
+
+    model: RobotModel
+    path: SplinePath
+
+    def __call__(self, s: float) -> Array:
+        """The pose `(4, 4)` at path parameter `s`."""
+        return self.model.fk(self.path.positions(np.array([s]))[0])

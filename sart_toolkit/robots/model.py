@@ -23,18 +23,23 @@ _IK_STEPS = 60
 _IK_DAMPING = 1e-4
 _IK_TOLERANCE = 1e-6
 _IK_MAX_STEP = 0.4
+# An orientation that is far off should not shake the joints of an arm that can't reach it.
+_IK_DAMPING_OF_FEW = 0.03
+# Of its way home, so much of a redundant arm's posture returns in each step of a solution.
+_HOMING = 0.01
 _LIMIT_TOLERANCE = 1e-6
 
 
 class RobotModel:
-    """The kinematics of a robot, its gripper at a fixed opening and its base at the world's origin.
+    """The kinematics of a robot, its gripper at a fixed opening.
 
-    Joint vectors `q` are `(n,)` [rad] in the order of `spec.arm_joints`.
+    Joint vectors `q` are `(n,)` [rad] in the order of `spec.arm_joints`; [m] of joints that slide.
 
     Attributes:
         spec: the robot.
         urdf: path of its composed URDF.
-        lower, upper: joint limits `(n,)` [rad].
+        lower, upper: joint limits `(n,)` [rad], or [m] of joints that slide.
+        slides: which joints do `(n,)`.
     """
 
     def __init__(
@@ -48,8 +53,7 @@ class RobotModel:
             gripper: gripper command in [0, 1] at which link poses are computed.
 
         Raises:
-            InvalidInput: gripper command out of range, joints in another order or without limits,
-                or a source URDF isn't acceptable.
+            InvalidInput: gripper command out of range, or a source URDF isn't acceptable.
             UnknownName: a joint or frame of `spec` or `held` isn't in the URDF.
             MissingExtra, MissingFile, BrokenFile: a source URDF or mesh is missing or unreadable.
             CannotWrite: the composed URDF can't be written.
@@ -65,15 +69,6 @@ class RobotModel:
                 f"{spec.name}: Pinocchio can't read its URDF ({error}); check the source URDFs"
             ) from error
         linkage = spec.gripper.joint_positions(gripper)
-        missing = [n for n in (*spec.arm_joints, *linkage) if not full.existJointName(n)]
-        if missing:
-            raise unknown_name("joint", missing[0], list(full.names)[1:])
-        for name in (*spec.arm_joints, *linkage):
-            if full.joints[full.getJointId(name)].nq != 1:
-                raise InvalidInput(
-                    f"{spec.name}: joint {name!r} is continuous, expected one with limits; make it "
-                    "revolute in its URDF"
-                )
         reference = pin.neutral(full)
         for name, position in linkage.items():
             reference[full.joints[full.getJointId(name)].idx_q] = position
@@ -81,15 +76,13 @@ class RobotModel:
             full.getJointId(name) for name in list(full.names)[1:] if name not in spec.arm_joints
         ]
         self._model = pin.buildReducedModel(full, locked, reference)
-        if list(self._model.names)[1:] != list(spec.arm_joints):
-            raise InvalidInput(
-                f"{spec.name}: arm_joints must be in the URDF's order "
-                f"{list(self._model.names)[1:]}, got {list(spec.arm_joints)}"
-            )
         self._data = self._model.createData()
         self._tool = self._frame(spec.tool_frame)
         self.lower = frozen(self._model.lowerPositionLimit)
         self.upper = frozen(self._model.upperPositionLimit)
+        joints = list(self._model.joints)[1:]
+        self.slides = frozen([joint.shortname() == "JointModelPZ" for joint in joints], bool)
+        self._posture = np.clip(spec.home, self.lower, self.upper)
 
     @property
     def pinocchio_model(self) -> pin.Model:
@@ -133,7 +126,8 @@ class RobotModel:
             at = np.unravel_index(int(np.argmax(over)), over.shape)
             j = at[-1]
             raise InvalidInput(
-                f"{self.spec.arm_joints[j]}: {q[at]:.3f} rad is outside its limits "
+                f"{self.spec.arm_joints[j]}: {q[at]:.3f} {'m' if self.slides[j] else 'rad'} is "
+                "outside its limits "
                 f"[{self.lower[j]:.3f}, {self.upper[j]:.3f}]"
             )
         return q
@@ -165,7 +159,10 @@ class RobotModel:
     def ik(self, T_world_tool: Array, q_near: Array, max_step: float | None = None) -> Array:
         """The joint configuration `(n,)` near `q_near` that puts the tool at a pose.
 
-        Damped least squares from `q_near`, within joint limits, to 1 µm and 1 µrad.
+        Damped least squares from `q_near`, within joint limits, to 1 µm and 1 µrad. An arm of more
+        than six joints also goes a little towards its home where that doesn't move the tool. One
+        of fewer goes to the position, and turns the tool as far as it can: `reached` says where
+        that is.
 
         Args:
             T_world_tool: desired tool pose `(4, 4)`.
@@ -181,16 +178,16 @@ class RobotModel:
         start = self.check_q(q_near)
         q = np.clip(start, self.lower, self.upper)
         model, data, tool = self._model, self._data, self._tool
-        eye = _IK_DAMPING**2 * np.eye(6)
+        step = self._step if len(start) >= 6 else self._step_of_few
         error = np.zeros(6)
         for _ in range(_IK_STEPS):
             pin.computeJointJacobians(model, data, q)
             pin.updateFramePlacement(model, data, tool)
             J = pin.getFrameJacobian(model, data, tool, pin.ReferenceFrame.LOCAL)
             error = pin.log6(data.oMf[tool].actInv(desired)).vector
-            if np.abs(error).max() < _IK_TOLERANCE:
+            dq, left = step(J, error, q)
+            if left < _IK_TOLERANCE:
                 break
-            dq = J.T @ np.linalg.solve(J @ J.T + eye, error)
             largest = np.abs(dq).max()
             if largest > _IK_MAX_STEP:
                 dq *= _IK_MAX_STEP / largest
@@ -202,13 +199,45 @@ class RobotModel:
                 f"and {np.rad2deg(np.linalg.norm(error[3:])):.1f} deg remain within joint limits; "
                 "choose a pose nearer to the robot or another start"
             )
-        step = float(np.abs(q - start).max())
-        if max_step is not None and step > max_step:
+        moved = float(np.abs(q - start).max())
+        if max_step is not None and moved > max_step:
             raise MotionRejected(
-                f"joint jump: a step of {step:.2f} rad exceeds {max_step:.2f} rad, the pose is on "
+                f"joint jump: a step of {moved:.2f} rad exceeds {max_step:.2f} rad, the pose is on "
                 "another branch or too far; move in smaller steps"
             )
         return q
+
+    def _step(self, J: Array, error: Array, q: Array) -> tuple[Array, float]:
+        """The joints' next step `(n,)` towards a pose, and how far it is yet."""
+        damped = J @ J.T + _IK_DAMPING**2 * np.eye(6)
+        if len(q) == 6:
+            dq = J.T @ np.linalg.solve(damped, error)
+        else:
+            # What brings the arm home, less what of that moves the tool.
+            home = _HOMING * (self._posture - q)
+            dq = home + J.T @ np.linalg.solve(damped, error - J @ home)
+        return dq, float(np.abs(error).max())
+
+    def _step_of_few(self, J: Array, error: Array, q: Array) -> tuple[Array, float]:
+        """The same for an arm of fewer than six joints: position first, then what turns it.
+
+        `error` is that of a motion by both at once; for the position alone its chord counts.
+        """
+        motion = pin.exp6(pin.Motion(error))
+        p, w = motion.translation, error[3:]
+        dq = _damped(J[:3], p)
+        # What turns the tool about its place.
+        still = np.eye(len(q)) - _damped(J[:3], J[:3])
+        turning = J[3:] @ still
+        more = still @ _damped(turning, w - J[3:] @ dq, _IK_DAMPING_OF_FEW)
+        return dq + more, float(max(np.abs(p).max(), np.abs(more).max()))
+
+    def reached(self, T_world_tool: Array, q: Array) -> Array:
+        """The pose `(4, 4)` that `ik` meant by `q (n,)`: the one desired, if the arm can have it.
+
+        An arm of fewer than six joints may only have turned the tool as far as it can.
+        """
+        return T_world_tool if len(q) >= 6 else self.fk(q)
 
     def link_poses(self, q: Array) -> dict[str, Array]:
         """Every frame's pose `(4, 4)` in the world at `q`, by name."""
@@ -217,3 +246,8 @@ class RobotModel:
             frame.name: np.array(self._data.oMf[i].homogeneous)
             for i, frame in enumerate(self._model.frames)
         }
+
+
+def _damped(J: Array, x: Array, damping: float = _IK_DAMPING) -> Array:
+    """The damped least-squares solution of J y = x."""
+    return np.asarray(J.T @ np.linalg.solve(J @ J.T + damping**2 * np.eye(len(J)), x))

@@ -25,6 +25,8 @@ _MAX_DEPTH = 32
 _MAX_LINKS = 1000
 # Positions and sizes [m] above this are those of a file in millimetres, or damaged.
 _MAX_LENGTH = 100.0
+# Cables end far before four whole turns to either side.
+_MOST_TURN = 8 * np.pi
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
@@ -70,9 +72,9 @@ _RULES: dict[str, _Rule] = {
             "axis": _AT_MOST_ONE,
             "limit": _AT_MOST_ONE,
             "dynamics": _AT_MOST_ONE,
+            "mimic": _AT_MOST_ONE,
         },
-        # The robot's GripperSpec describes the linkage; readers treat mimic differently.
-        ("mimic", "safety_controller", "calibration"),
+        ("safety_controller", "calibration"),
     ),
     "visual": _Rule(
         {}, {"origin": _AT_MOST_ONE, "geometry": _ONE}, ("name", "material", "verbose")
@@ -104,11 +106,12 @@ _RULES: dict[str, _Rule] = {
         {
             "lower": _FREE,
             "upper": _FREE,
-            "effort": _Numbers(kind="at least 0"),
-            "velocity": _Numbers(kind="at least 0"),
+            "effort": _Numbers(kind="at least 0", required=False),
+            "velocity": _Numbers(kind="at least 0", required=False),
         }
     ),
     "dynamics": _Rule({"damping": _FREE, "friction": _FREE}),
+    "mimic": _Rule({"joint": None, "multiplier": _FREE, "offset": _FREE}),
 }
 
 
@@ -172,6 +175,12 @@ def parsed(source: Path, content: bytes | None = None) -> ET.Element:
             "which isn't read); remove it"
         )
 
+    if source.suffix == ".xacro" or b"<xacro:" in content:
+        raise InvalidInput(
+            f"{source.name}: is xacro, from which a URDF is still to be made; type: xacro "
+            f"{source.name} > {source.name.partition('.')[0]}.urdf (of ROS, or pip install "
+            "xacro), and give that"
+        )
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.StartDoctypeDeclHandler = doctype
     try:
@@ -213,6 +222,8 @@ def _checked_top(file: str, element: ET.Element) -> ET.Element:
     _check(where, element)
     if element.tag == "joint":
         _check_joint(where, element)
+    else:
+        _check_inertia(where, element)
     return element
 
 
@@ -316,3 +327,21 @@ def _check_joint(where: str, joint: ET.Element) -> None:
         lower, upper = (float(limit.get(name, "0")) for name in ("lower", "upper"))
         if lower > upper:
             raise InvalidInput(f"{where}: <limit>: lower {lower} is above upper {upper}")
+        if kind == "revolute" and max(abs(lower), abs(upper)) > _MOST_TURN:
+            raise InvalidInput(
+                f"{where}: <limit>: from {lower:g} to {upper:g} rad is more than any arm turns; "
+                "give it in rad, not degrees"
+            )
+
+
+def _check_inertia(where: str, link: ET.Element) -> None:
+    inertia = link.find("inertial/inertia")
+    if inertia is None:
+        return
+    rows = [[float(inertia.get("i" + "".join(sorted(a + b)), 0)) for b in "xyz"] for a in "xyz"]
+    moments = np.linalg.eigvalsh(np.array(rows))
+    if (least := float(moments.min())) < -1e-9 - 1e-3 * float(moments.sum()):
+        raise InvalidInput(
+            f"{where}: <inertia>: no body has it, its least principal moment is {least:.3g} kg m²; "
+            "correct it, or remove <inertia> for that of a ball"
+        )

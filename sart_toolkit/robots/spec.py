@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,10 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from sart_toolkit.data.assets import asset
-from sart_toolkit.errors import InvalidInput, MissingExtra, MissingFile
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, check_array, check_pose, check_positive, frozen
-from sart_toolkit.userfiles import local_file
+from sart_toolkit.robots.references import resource_path
 
 _SIDES = 16
 
@@ -202,42 +200,86 @@ def check_gripper(gripper: float) -> float:
 
 @dataclass(frozen=True)
 class GripperSpec:
-    """A gripper: its URDF, its linkage, and what its one command means.
+    """A gripper: where it is, its linkage, and what its one command means.
 
-    The command is 0 open, 1 closed. `driver` is the joint that the motor moves, from 0 to
-    `closed_position` ([rad], or [m] where it slides); `followers` maps each linked joint to its
-    ratio to the driver. `finger_links` are the links that may touch what is grasped. `force`
-    ([N m] or [N]) and `speed` ([rad/s] or [m/s]) bound the driver. `armature` ([kg m²] or [kg]) is
-    the drive's inertia reflected to each joint through its gears: links of a few grams alone would
-    hold a heavy object badly in any simulator.
+    `urdf` is its own URDF, fixed to `parent_frame` of the arm at `T_parent_gripper`; its links and
+    joints are then called `gripper_...`. Without `urdf` it is part of the arm's.
+
+    The command is 0 open, 1 closed. `driver` is the joint that the motor moves, from
+    `open_position` to `closed_position` ([rad], or [m] where it slides; either may be 0);
+    `followers` maps each linked joint to its ratio to the driver, as the URDF's `<mimic>` has them.
+    Without `driver` the tool has no fingers. `finger_links` are the links that may touch what is
+    grasped. `force` ([N m] or [N]) and `speed` ([rad/s] or [m/s]) bound the driver. `armature`
+    ([kg m²] or [kg]) is the drive's inertia reflected to each joint through its gears: links of a
+    few grams alone would hold a heavy object badly in any simulator.
     """
 
-    urdf: str
-    parent_frame: str
-    driver: str
-    followers: Mapping[str, float]
-    closed_position: float
-    finger_links: tuple[str, ...]
+    urdf: str | None = None
+    parent_frame: str | None = None
+    driver: str | None = None
+    followers: Mapping[str, float] = field(default_factory=dict)
+    closed_position: float = 0.0
+    finger_links: tuple[str, ...] = ()
     T_parent_gripper: Array = field(default_factory=lambda: np.eye(4))
     force: float = 20.0
     speed: float = 2.0
     armature: float = 0.0
+    open_position: float = 0.0
+
+    def __post_init__(self) -> None:
+        if (self.urdf is None) != (self.parent_frame is None):
+            raise InvalidInput(
+                f"gripper: expected both or neither of urdf and parent_frame, got {self.urdf!r} "
+                f"and {self.parent_frame!r}; without urdf it is part of the arm's URDF"
+            )
+        if self.driver is None and (self.followers or self.closed_position != self.open_position):
+            raise InvalidInput(
+                "gripper: has followers or positions but no driver; name the joint that moves it"
+            )
+        if self.driver is not None and not abs(self.closed_position - self.open_position) > 0:
+            raise InvalidInput(
+                f"gripper: open_position and closed_position are both {self.closed_position}; "
+                "expected two positions of the driver"
+            )
+        for name in ("open_position", "closed_position"):
+            if not np.isfinite(getattr(self, name)):
+                raise InvalidInput(f"{name}: expected a number, got {getattr(self, name)}")
+        check_positive("force", self.force)
+        check_positive("speed", self.speed)
+        T = check_pose("T_parent_gripper", self.T_parent_gripper)
+        object.__setattr__(self, "T_parent_gripper", frozen(T))
+
+    def driver_position(self, command: float) -> float:
+        """The driver's position [rad or m] at a command in [0, 1]."""
+        return self.open_position + (self.closed_position - self.open_position) * command
+
+    def command_at(self, position: float) -> float:
+        """The command that a position [rad or m] of the driver is that of."""
+        return (position - self.open_position) / (self.closed_position - self.open_position)
+
+    @property
+    def ratios(self) -> dict[str, float]:
+        """Each joint of the linkage with its ratio to the driver, which comes first."""
+        return {} if self.driver is None else {self.driver: 1.0, **self.followers}
 
     def joint_positions(self, command: float) -> dict[str, float]:
         """Every linkage joint's position [rad or m] at a command in [0, 1]."""
-        at = self.closed_position * command
-        return {self.driver: at, **{name: at * r for name, r in self.followers.items()}}
+        at = self.driver_position(command)
+        return {name: at * ratio for name, ratio in self.ratios.items()}
 
 
 @dataclass(frozen=True)
 class RobotSpec:
     """An arm with a gripper as data; everything else about it is derived from its URDFs.
 
-    `urdf` is `package:path/inside/it` or a path. Joint arrays follow `arm_joints`:
-    `home` [rad], `velocity_limits` [rad/s], `acceleration_limits` [rad/s²], `jerk_limits`
-    [rad/s³] (a URDF has no such entries). `T_gripper_tool`: the tool frame in the gripper's base,
-    z pointing out between the fingertips, x along the direction in which they close. `cameras` are
-    mounted on its frames; policies use the one called "wrist" unless specified otherwise.
+    `urdf` is `package:path/inside/it` or a path; `package_dirs` are folders to look in for the
+    `package://` meshes of both URDFs. Joint arrays follow `arm_joints`, [rad] of joints that turn
+    and [m] of those that slide: `home`, `velocity_limits` [/s], `acceleration_limits` [/s²],
+    `jerk_limits` [/s³] (a URDF has no such entries). Joints of neither arm nor gripper are held at
+    `held_joints`, or at 0 or the limit nearest to it. The arm's URDF stands at `T_world_base`.
+    `T_gripper_tool`: the tool frame in `gripper_base`, a link of gripper or arm; z pointing out
+    between the fingertips, x along the direction in which they close. `cameras` are mounted on its
+    frames; policies use the one called "wrist" unless specified otherwise.
     """
 
     name: str
@@ -254,18 +296,36 @@ class RobotSpec:
     attachments: tuple[Attachment, ...] = ()
     link_colours: Mapping[str, tuple[float, float, float, float]] = field(default_factory=dict)
     tool_frame: str = "tool"
+    T_world_base: Array = field(default_factory=lambda: np.eye(4))
+    package_dirs: tuple[str, ...] = ()
+    held_joints: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.arm_joints)
+        if len(set(self.arm_joints)) < n or not n:
+            raise InvalidInput(
+                f"arm_joints of {self.name}: expected different names, got {list(self.arm_joints)}"
+            )
         for name in ("home", "velocity_limits", "acceleration_limits", "jerk_limits"):
             object.__setattr__(self, name, frozen(check_array(name, getattr(self, name), (n,))))
             if name != "home" and (getattr(self, name) <= 0).any():
                 raise InvalidInput(f"{name}: expected numbers > 0, got {getattr(self, name)}")
-        T = check_pose("T_gripper_tool", self.T_gripper_tool)
-        object.__setattr__(self, "T_gripper_tool", frozen(T))
+        for name in ("T_gripper_tool", "T_world_base"):
+            object.__setattr__(self, name, frozen(check_pose(name, getattr(self, name))))
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names):
             raise InvalidInput(f"cameras of {self.name}: expected different names, got {names}")
+        for joint in self.held_joints:
+            if joint in self.arm_joints or joint in self.gripper.ratios:
+                raise InvalidInput(
+                    f"held_joints of {self.name}: {joint!r} is a joint of arm or gripper, which "
+                    "move; remove it there"
+                )
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The URDFs of arm and gripper, one or two."""
+        return (self.urdf,) if self.gripper.urdf is None else (self.urdf, self.gripper.urdf)
 
     def files_needed(self) -> list[Path]:
         """The URDFs that are named by a path, and the meshes that they name.
@@ -275,30 +335,6 @@ class RobotSpec:
         """
         from sart_toolkit.robots.urdf import source_files
 
-        named = [urdf for urdf in (self.urdf, self.gripper.urdf) if ":" not in urdf]
-        return [file for urdf in named for file in source_files(resource_path(urdf))]
-
-
-def resource_path(resource: str) -> Path:
-    """The file that `package:path/inside/it` or a plain path names; `sart_toolkit:` is `assets/`.
-
-    Raises:
-        MissingExtra: the package isn't installed.
-        MissingFile: the file isn't there.
-    """
-    package, colon, inside = resource.partition(":")
-    if colon and package == "sart_toolkit":
-        path = asset(inside)
-    elif colon:
-        try:
-            found = importlib.util.find_spec(package)
-        except (ModuleNotFoundError, ValueError):
-            found = None
-        if found is None or found.origin is None:
-            raise MissingExtra(f"{resource}: package {package!r} missing; pip install {package}")
-        path = Path(found.origin).parent / inside
-    else:
-        path = local_file(resource)
-    if not path.is_file():
-        raise MissingFile(f"{resource}: no such file ({path.name}); check the robot's urdf entries")
-    return path
+        named = [urdf for urdf in self.sources if ":" not in urdf]
+        dirs = self.package_dirs
+        return [file for urdf in named for file in source_files(resource_path(urdf), dirs)]

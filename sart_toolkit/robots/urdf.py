@@ -11,8 +11,10 @@ import dataclasses
 import functools
 import hashlib
 import importlib.metadata
+import importlib.util
 import io
 import json
+import logging
 import os
 import re
 import shutil
@@ -26,8 +28,28 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, SartError, unknown_name
-from sart_toolkit.poses import Array, inverse, rpy_pose
+from sart_toolkit.errors import (
+    BrokenFile,
+    CannotWrite,
+    InvalidInput,
+    MissingExtra,
+    SartError,
+    unknown_name,
+)
+from sart_toolkit.poses import Array, inverse
+from sart_toolkit.robots.elements import (
+    add_joint,
+    child_of,
+    floats,
+    geometry_of,
+    inertia_of,
+    inertial_of,
+    material_of,
+    origin_of,
+    pose_of,
+    rigid_link,
+    shape_of,
+)
 from sart_toolkit.robots.enclosure import (
     TOLERANCE,
     Faces,
@@ -38,17 +60,18 @@ from sart_toolkit.robots.enclosure import (
     shape_stands_out,
     standing_out,
 )
+from sart_toolkit.robots.joints import moving_groups, set_joints
+from sart_toolkit.robots.references import mesh_path, resource_path, where_to_look
 from sart_toolkit.robots.source import links_and_joints, parsed, read_bytes
 from sart_toolkit.robots.spec import (
     Attachment,
     RobotSpec,
     Shape,
-    mass_properties,
-    resource_path,
 )
 
+_log = logging.getLogger(__name__)
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 13
+_RECIPE = 14
 # What shades and hulls: another version may make other meshes.
 _MADE_WITH = ("trimesh", "scipy", "numpy")
 # Faces that meet at a sharper angle show an edge.
@@ -60,6 +83,10 @@ _MAX_MESH_BYTES = 100 << 20
 _MAX_EXTENT = 100.0
 # A link given a mass but no inertia has that of a ball of this radius [m].
 _BALL_RADIUS = 0.05
+# A link that moves and has no mass gets that of its hull at this density [kg/m³].
+_DENSITY = 1000.0
+_ORIGIN = "world_origin"
+_NOTES = "notes.json"
 
 
 def cache_dir() -> Path:
@@ -77,12 +104,12 @@ def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
         MissingExtra, MissingFile: a source URDF isn't there.
         BrokenFile: a source URDF or a mesh can't be parsed, or a mesh is missing.
         InvalidInput: a number, shape or reference in a source isn't acceptable, two links or
-            joints have the same name, the links aren't one tree, a link is drawn but has no
-            collision shape, or a mesh is empty or not finite.
+            joints have the same name, the links aren't one tree, the joints aren't as the
+            robot has them, or a mesh is empty or not finite.
         UnknownName: a joint or a body is to be fixed to a frame that isn't there.
         CannotWrite: the cache can't be written.
     """
-    sources = [resource_path(spec.urdf), resource_path(spec.gripper.urdf)]
+    sources = [resource_path(source) for source in spec.sources]
     attachments = [*spec.attachments, *held]
     key = _key(spec, attachments, sources)
     directory = cache_dir() / f"{spec.name}-{key}"
@@ -100,6 +127,12 @@ def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
     return urdf
 
 
+def assumptions(urdf: Path) -> list[str]:
+    """What had to be assumed for a composed URDF, a line each."""
+    notes: list[str] = json.loads((urdf.parent / _NOTES).read_bytes())
+    return notes
+
+
 def _key(spec: RobotSpec, attachments: Sequence[Attachment], sources: Sequence[Path]) -> str:
     """A hash of all that the composed robot is made from: its data and its files' contents."""
     files = []
@@ -108,7 +141,7 @@ def _key(spec: RobotSpec, attachments: Sequence[Attachment], sources: Sequence[P
         meshes = {
             name: _digest(path) if os.path.isfile(path) else None
             for name in _mesh_names(source, digest)
-            for path in [_mesh_path(name, source.parent)]
+            for path in [mesh_path(name, source, spec.package_dirs)]
         }
         files.append([source.name, digest, meshes])
     made_from = {
@@ -156,15 +189,15 @@ def _mesh_names(source: Path, digest: str) -> tuple[str, ...]:
     return tuple(sorted({mesh.get("filename", "") for mesh in parsed(source).iter("mesh")}))
 
 
-def source_files(source: Path) -> list[Path]:
-    """A URDF and the existing mesh files that it names.
+def source_files(source: Path, package_dirs: Sequence[str] = ()) -> list[Path]:
+    """A URDF and the existing mesh files that it names, which `package_dirs` help to find.
 
     Raises:
         BrokenFile: the URDF can't be read.
     """
     names = _mesh_names(source, _digest(source))
-    meshes = [_mesh_path(name, source.parent) for name in names]
-    return [source, *(path for path in meshes if path.is_file())]
+    meshes = [mesh_path(name, source, package_dirs) for name in names]
+    return [source, *(path for path in meshes if os.path.isfile(path))]
 
 
 def _intact(directory: Path) -> bool:
@@ -192,11 +225,17 @@ def _make(
     try:
         made = work / "made"
         made.mkdir()
-        _compose(spec, attachments, sources, made)
+        notes = _compose(spec, attachments, sources, made)
+        (made / _NOTES).write_text(json.dumps(notes, indent=1))
         files = {path.name: _digest(path) for path in sorted(made.iterdir())}
         (made / _MANIFEST).write_text(json.dumps(files, indent=1))
         if _key(spec, attachments, sources) != key:
             raise BrokenFile(f"{spec.name}: its files changed while they were read; try again")
+        if notes:
+            _log.warning(
+                "%s: %s%s; `sart doctor --robot` lists what was assumed",
+                spec.name, notes[0], f", and {len(notes) - 1} more" if notes[1:] else "",
+            )  # fmt: skip
         try:
             if directory.exists() and not _intact(directory):
                 os.replace(directory, work / "damaged")
@@ -223,18 +262,26 @@ def _plain(value: Any) -> Any:
 
 def _compose(
     spec: RobotSpec, attachments: Sequence[Attachment], sources: Sequence[Path], work: Path
-) -> None:
+) -> list[str]:
+    """Write the composed URDF and its meshes, and say what had to be assumed."""
     robot = ET.Element("robot", name=spec.name)
-    for source, prefix in zip(sources, ("", _GRIPPER_PREFIX), strict=True):
-        for element in _elements(source, prefix):
+    notes: list[str] = []
+    for source, prefix in zip(sources, ("", _GRIPPER_PREFIX), strict=False):
+        for element in source_elements(source, prefix, spec.package_dirs):
             robot.append(element)
             if element.tag == "link":
+                if element.find("visual") is not None and element.find("collision") is None:
+                    notes.append(
+                        f"link {element.get('name')!r} has no collision shape: hulls of what is "
+                        "drawn taken"
+                    )
                 _prepare(element, source.parent, work, f"{len(robot):03d}", spec)
-    for parent, child, T in (
-        (spec.gripper.parent_frame, spec.gripper_base, spec.gripper.T_parent_gripper),
-        (spec.gripper_base, spec.tool_frame, spec.T_gripper_tool),
-        *((body.frame, body.name, body.T_frame_body) for body in attachments),
-    ):
+    mounts = [(spec.gripper_base, spec.tool_frame, spec.T_gripper_tool)]
+    if spec.gripper.parent_frame is not None:
+        T = spec.gripper.T_parent_gripper
+        mounts.insert(0, (spec.gripper.parent_frame, spec.gripper_base, T))
+    mounts += [(body.frame, body.name, body.T_frame_body) for body in attachments]
+    for parent, child, T in mounts:
         add_joint(robot, f"{child}_fixed", parent, child, T, "fixed")
     robot.append(ET.Element("link", name=spec.tool_frame))
     for body in attachments:
@@ -248,30 +295,65 @@ def _compose(
     for end in robot.findall("joint/parent") + robot.findall("joint/child"):
         if end.get("link") not in links:
             raise unknown_name("frame", str(end.get("link")), links)
-    _check_tree(spec.name, robot)
+    root = _check_tree(spec.name, robot)
+    notes += set_joints(spec, robot)
+    notes += _weighed(robot, work)
+    if not np.array_equal(spec.T_world_base, np.eye(4)):
+        robot.append(ET.Element("link", name=_ORIGIN))
+        add_joint(robot, f"{root}_fixed", _ORIGIN, root, spec.T_world_base, "fixed")
     for link in robot.findall("link"):
         inertial = link.find("inertial")
         if inertial is None:
             # A simulator would give a link without inertia one kilogram.
-            link.append(_inertial(1e-3, np.zeros(3), 1e-6 * np.eye(3)))
+            link.append(inertial_of(1e-3, np.zeros(3), 1e-6 * np.eye(3)))
         elif inertial.find("inertia") is None:
-            mass = float(_found(inertial, "mass").get("value", ""))
+            mass = float(child_of(inertial, "mass").get("value", ""))
             moment = 0.4 * max(mass, 1e-3) * _BALL_RADIUS**2
-            inertial.append(_inertia(moment * np.eye(3)))
+            inertial.append(inertia_of(moment * np.eye(3)))
     _add_armature(robot, spec)
     ET.indent(robot)
     ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)
+    return notes
 
 
-def _check_tree(name: str, robot: ET.Element) -> None:
-    """Return if the joints make one tree of the links.
+def _weighed(robot: ET.Element, work: Path) -> list[str]:
+    """Give what a joint moves a mass where the URDF has none, and say so."""
+    notes = []
+    for link, group in moving_groups(robot):
+        masses = [
+            each.get("value", "0")
+            for each_link in group
+            for each in each_link.findall("inertial/mass")
+        ]
+        if any(float(mass) > 0 for mass in masses):
+            continue
+        points = [
+            _moved(part.points if isinstance(part, HullPart) else part.shape.corners(), np.eye(4))
+            for part in link_parts(link, work)
+        ]
+        if not points:
+            continue
+        hull = trimesh.Trimesh(np.concatenate(points)).convex_hull
+        hull.density = _DENSITY
+        for old in link.findall("inertial"):
+            link.remove(old)
+        link.append(inertial_of(hull.mass, hull.center_mass, hull.moment_inertia))
+        notes.append(
+            f"link {link.get('name')!r} has no mass: {hull.mass:.2g} kg taken, its hull at "
+            f"{_DENSITY:g} kg/m³"
+        )
+    return notes
+
+
+def _check_tree(name: str, robot: ET.Element) -> str:
+    """The name of the link that all others hang on, if the joints make one tree of the links.
 
     Raises:
         InvalidInput: a link hangs on two joints or on none, in a loop, or has a joint's name.
     """
     parent_of: dict[str, str] = {}
     for joint in robot.findall("joint"):
-        parent, child = (_found(joint, tag).get("link", "") for tag in ("parent", "child"))
+        parent, child = (child_of(joint, tag).get("link", "") for tag in ("parent", "child"))
         if child in parent_of:
             raise InvalidInput(
                 f"{name}: link {child!r} is the child of two joints, expected one; remove one"
@@ -294,17 +376,12 @@ def _check_tree(name: str, robot: ET.Element) -> None:
         joined.update(chain)
     for joint in robot.findall("joint"):
         # A fixed joint is a frame too, at its child's place.
-        if joint.get("name") in links and joint.get("name") != _found(joint, "child").get("link"):
+        if joint.get("name") in links and joint.get("name") != child_of(joint, "child").get("link"):
             raise InvalidInput(
                 f"{name}: joint {joint.get('name')!r} has the name of a link that isn't its child; "
                 "rename it"
             )
-
-
-def _found(element: ET.Element, tag: str) -> ET.Element:
-    found = element.find(tag)
-    assert found is not None
-    return found
+    return roots[0]
 
 
 def _add_armature(robot: ET.Element, spec: RobotSpec) -> None:
@@ -314,25 +391,41 @@ def _add_armature(robot: ET.Element, spec: RobotSpec) -> None:
     for joint in robot.findall("joint"):
         if joint.get("name") not in moving or not spec.gripper.armature:
             continue
-        inertial = _found(links[_found(joint, "child").get("link")], "inertial")
+        inertial = child_of(links[child_of(joint, "child").get("link")], "inertial")
         part, names = (
             ("mass", ["value"])
             if joint.get("type") == "prismatic"
             else ("inertia", ["ixx", "iyy", "izz"])
         )
-        element = _found(inertial, part)
+        element = child_of(inertial, part)
         for name in names:
             element.set(name, f"{max(float(element.get(name, 0)), spec.gripper.armature):.9g}")
 
 
-def _elements(source: Path, prefix: str) -> list[ET.Element]:
-    """Links and joints of a URDF, checked, names prefixed, vendor extensions left out."""
+def source_elements(
+    source: Path, prefix: str = "", package_dirs: Sequence[str] = ()
+) -> list[ET.Element]:
+    """Links and joints of a URDF, checked, names prefixed, meshes by their paths.
+
+    Raises:
+        BrokenFile: it can't be read, or a mesh is missing.
+        InvalidInput: a number, shape or reference in it isn't acceptable.
+    """
     kept = links_and_joints(source)
     for element in kept:
         element.set("name", prefix + element.get("name", ""))
-        for tag in ("parent", "child"):
+        for tag, name in (("parent", "link"), ("child", "link"), ("mimic", "joint")):
             for child in element.findall(tag):
-                child.set("link", prefix + child.get("link", ""))
+                child.set(name, prefix + child.get(name, ""))
+        for mesh in element.iter("mesh"):
+            reference = mesh.get("filename", "")
+            path = mesh_path(reference, source, package_dirs)
+            if not os.path.isfile(path):
+                raise BrokenFile(
+                    f"{source.name}: link {element.get('name')!r}: mesh {reference} is missing; "
+                    f"{where_to_look(reference, package_dirs)}"
+                )
+            mesh.set("filename", str(path.absolute()))
     return kept
 
 
@@ -341,11 +434,11 @@ def _prepare(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
 
     Raises:
         BrokenFile: a mesh is missing or can't be read.
-        InvalidInput: a mesh is empty or not finite, or the link is drawn but doesn't collide.
+        InvalidInput: a mesh is empty or not finite.
     """
     name = link.get("name", "")
     colour = spec.link_colours.get(name, (0.6, 0.6, 0.62, 1.0))
-    paths = [_mesh_path(mesh.get("filename", ""), base) for mesh in link.iter("mesh")]
+    paths = [base / mesh.get("filename", "") for mesh in link.iter("mesh")]
     digests = tuple(_digest(path) if os.path.isfile(path) else "" for path in paths)
     key = ET.tostring(link, encoding="unicode"), digests
     if key not in _prepared:
@@ -362,7 +455,7 @@ def _prepare(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
     for file, content in files.items():
         (work / f"{stem}_{file}").write_bytes(content)
     for index, element in enumerate(link.findall("visual")):
-        element.append(_material(f"{name}_{index}", colour))
+        element.append(material_of(f"{name}_{index}", colour))
 
 
 # Links are remembered by all that they are made from, since robots share them.
@@ -387,11 +480,6 @@ def _prepared_link(text: str, base: Path) -> tuple[str, dict[str, bytes]]:
 def _prepare_meshes(link: ET.Element, base: Path, work: Path) -> None:
     name = link.get("name", "")
     visuals, collisions = link.findall("visual"), link.findall("collision")
-    if visuals and not collisions:
-        raise InvalidInput(
-            f"link {name!r}: is drawn but has no collision shape, so nothing can be proved about "
-            "it; give it one in the URDF"
-        )
     for element in [*visuals, *collisions]:
         mesh = element.find("geometry/mesh")
         if mesh is not None:
@@ -422,9 +510,9 @@ def link_parts(link: ET.Element, folder: Path) -> list[Part]:
     for element in link.findall("collision"):
         mesh = element.find("geometry/mesh")
         if mesh is None:
-            parts.append(ShapePart(_shape(element)))
+            parts.append(ShapePart(shape_of(element)))
         else:
-            parts.append(HullPart(_moved(_loaded(mesh, folder).vertices, _place(element))))
+            parts.append(HullPart(_moved(_loaded(mesh, folder).vertices, pose_of(element))))
     return parts
 
 
@@ -439,7 +527,7 @@ def drawn_triangles(link: ET.Element, folder: Path) -> tuple[Array, Faces]:
         if mesh is None:
             continue
         loaded = _loaded(mesh, folder)
-        corners.append(_moved(loaded.vertices, _place(element)))
+        corners.append(_moved(loaded.vertices, pose_of(element)))
         triangles.append(np.asarray(loaded.faces, np.intp) + count)
         count += len(loaded.vertices)
     return np.concatenate(corners), np.concatenate(triangles)
@@ -447,7 +535,7 @@ def drawn_triangles(link: ET.Element, folder: Path) -> tuple[Array, Faces]:
 
 def drawn_shapes(link: ET.Element) -> list[Shape]:
     """The primitives that are drawn of a URDF's link, in its frame."""
-    return [_shape(v) for v in link.findall("visual") if v.find("geometry/mesh") is None]
+    return [shape_of(v) for v in link.findall("visual") if v.find("geometry/mesh") is None]
 
 
 def drawn_elements(
@@ -459,17 +547,17 @@ def drawn_elements(
     """
     found: list[tuple[Shape | trimesh.Trimesh, Array, tuple[float, float, float, float]]] = []
     for visual in link.findall("visual"):
-        red, green, blue, alpha = _floats(_found(visual, "material/color").get("rgba", ""))
+        red, green, blue, alpha = floats(child_of(visual, "material/color").get("rgba", ""))
         mesh = visual.find("geometry/mesh")
         what: Shape | trimesh.Trimesh
         if mesh is None:
-            what = dataclasses.replace(_shape(visual), rgba=(red, green, blue, alpha))
+            what = dataclasses.replace(shape_of(visual), rgba=(red, green, blue, alpha))
         else:
             path = folder / mesh.get("filename", "")
             loaded = trimesh.load(path, force="mesh", process=False)
             assert isinstance(loaded, trimesh.Trimesh)
             what = loaded
-        found.append((what, _place(visual), (red, green, blue, alpha)))
+        found.append((what, pose_of(visual), (red, green, blue, alpha)))
     return found
 
 
@@ -479,8 +567,6 @@ def _enclosed(link: ET.Element, base: Path, vertices: Array, faces: Faces) -> li
     A primitive that stands out becomes a part itself.
     """
     parts = link_parts(link, base)
-    if not parts:
-        return []
     made = enclose(parts, vertices, faces)
     for shape in drawn_shapes(link):
         if shape_stands_out(made, shape):
@@ -497,12 +583,12 @@ def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path) -> None:
             mesh = element.find("geometry/mesh")
             if mesh is None:
                 mesh = ET.SubElement(ET.SubElement(element, "geometry"), "mesh")
-            T = inverse(_place(element))
+            T = inverse(pose_of(element))
             hull = trimesh.Trimesh(_moved(part.points, T)).convex_hull
             _export(hull, mesh, work, f"collision_{index}.obj")
         elif index >= len(own):
-            element.append(_origin(part.shape.T_body_shape))
-            element.append(_geometry(part.shape))
+            element.append(origin_of(part.shape.T_body_shape))
+            element.append(geometry_of(part.shape))
 
 
 def creased(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -522,49 +608,26 @@ def _moved(points: Array, T: Array) -> Array:
     return np.asarray(points, np.float64) @ T[:3, :3].T + T[:3, 3]
 
 
-def _place(element: ET.Element) -> Array:
-    """An element's pose `(4, 4)` in its link."""
-    origin = element.find("origin")
-    given = {} if origin is None else origin.attrib
-    return rpy_pose(*(_floats(given.get(key, "0 0 0")) for key in ("xyz", "rpy")))
-
-
-def _floats(text: str) -> list[float]:
-    return [float(word) for word in text.split()]
-
-
-def _shape(element: ET.Element) -> Shape:
-    """The primitive of a visual or collision element, in the link's frame."""
-    T = _place(element)
-    shape = _found(element, "geometry")[0]
-    if shape.tag == "box":
-        x, y, z = _floats(shape.get("size", ""))
-        return Shape("box", (x, y, z), T)
-    radius = float(shape.get("radius", ""))
-    if shape.tag == "sphere":
-        return Shape("sphere", (radius,), T)
-    return Shape("cylinder", (radius, float(shape.get("length", ""))), T)
-
-
-def _mesh_path(name: str, base: Path) -> Path:
-    return Path(os.path.normpath(base / name))
-
-
 def _loaded(element: ET.Element, base: Path) -> trimesh.Trimesh:
     """A mesh element's mesh, scaled, in its own frame.
 
     Raises:
         BrokenFile: it is missing or can't be read.
         InvalidInput: its file is of another type than those that are read.
+        MissingExtra: what reads its type isn't installed.
     """
-    source = _mesh_path(element.get("filename", ""), base)
+    source = base / element.get("filename", "")
     if source.suffix.lower() not in _MESH_TYPES:
         raise InvalidInput(
             f"mesh {source.name}: expected a file ending in {', '.join(_MESH_TYPES)}; convert it"
         )
+    if source.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
+        raise MissingExtra(
+            f"mesh {source.name}: Collada files need pycollada; pip install 'sart_toolkit[meshes]'"
+        )
     if not os.path.isfile(source):
-        raise BrokenFile(f"mesh {source.name} is missing; reinstall the package it comes from")
-    return _mesh(source, _digest(source), tuple(_floats(element.get("scale", "1 1 1"))))
+        raise BrokenFile(f"mesh {source.name} is missing; put it there")
+    return _mesh(source, _digest(source), tuple(floats(element.get("scale", "1 1 1"))))
 
 
 @functools.lru_cache(maxsize=16)
@@ -608,78 +671,3 @@ def _check_mesh(mesh: trimesh.Trimesh, link: str, kind: str, file: str) -> None:
             f"{what} reaches {np.abs(mesh.vertices).max():.4g} m from its origin, expected at most "
             f"{_MAX_EXTENT:g} m; give it a scale"
         )
-
-
-def _origin(T: Array) -> ET.Element:
-    R = T[:3, :3]
-    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
-    if np.cos(pitch) > 1e-6:
-        roll, yaw = np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0])
-    else:
-        roll, yaw = np.arctan2(-R[1, 2], R[1, 1]), 0.0
-    return ET.Element("origin", xyz=_numbers(T[:3, 3]), rpy=_numbers([roll, pitch, yaw]))
-
-
-def _numbers(values: Any) -> str:
-    return " ".join(f"{float(v):.12g}" for v in values)
-
-
-def _material(name: str, rgba: tuple[float, ...]) -> ET.Element:
-    material = ET.Element("material", name=f"{name}_colour")
-    ET.SubElement(material, "color", rgba=_numbers(rgba))
-    return material
-
-
-def _inertial(mass: float, p: Array, inertia: Array) -> ET.Element:
-    inertial = ET.Element("inertial")
-    ET.SubElement(inertial, "origin", xyz=_numbers(p), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=f"{mass:.9g}")
-    inertial.append(_inertia(inertia))
-    return inertial
-
-
-def _inertia(inertia: Array) -> ET.Element:
-    entries = {
-        f"i{a}{b}": f"{inertia[i, j]:.9g}"
-        for i, a in enumerate("xyz")
-        for j, b in enumerate("xyz")
-        if i <= j
-    }
-    return ET.Element("inertia", entries)
-
-
-def add_joint(
-    robot: ET.Element, name: str, parent: str, child: str, T_parent_child: Array, kind: str
-) -> ET.Element:
-    """A joint of a URDF's `robot` element, by its kind (`fixed`, `revolute` or `prismatic`)."""
-    joint = ET.SubElement(robot, "joint", name=name, type=kind)
-    joint.append(_origin(T_parent_child))
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=child)
-    return joint
-
-
-def rigid_link(name: str, shapes: Sequence[Shape], mass: float) -> ET.Element:
-    """A URDF link of primitives, its inertia that of an even mass [kg]; 0 for one that is fixed."""
-    link = ET.Element("link", name=name)
-    link.append(_inertial(mass, *mass_properties(shapes, mass or 1.0)))
-    for index, shape in enumerate(shapes):
-        for kind in ("visual", "collision") if shape.collides else ("visual",):
-            element = ET.SubElement(link, kind)
-            element.append(_origin(shape.T_body_shape))
-            element.append(_geometry(shape))
-            if kind == "visual":
-                element.append(_material(f"{name}_{index}", shape.rgba))
-    return link
-
-
-def _geometry(shape: Shape) -> ET.Element:
-    geometry = ET.Element("geometry")
-    if shape.kind == "box":
-        ET.SubElement(geometry, "box", size=_numbers(shape.size))
-    elif shape.kind == "cylinder":
-        radius, length = (f"{v:.9g}" for v in shape.size)
-        ET.SubElement(geometry, "cylinder", radius=radius, length=length)
-    else:
-        ET.SubElement(geometry, "sphere", radius=f"{shape.size[0]:.9g}")
-    return geometry

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from sart_toolkit.errors import InvalidInput, MotionRejected, UnknownName, Unreachable
 from sart_toolkit.poses import check_pose, distance, inverse, pose, relative_motion
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import Attachment, Shape, resource_path
+from sart_toolkit.robots.references import resource_path
+from sart_toolkit.robots.spec import Attachment, Shape
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=60)
 

@@ -11,7 +11,7 @@ import pytest
 from sart_toolkit.errors import BrokenFile, InvalidInput, SartError, UnknownName
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.source import links_and_joints, parsed
-from sart_toolkit.robots.spec import resource_path
+from sart_toolkit.robots.references import resource_path
 from sart_toolkit.robots.urdf import composed_urdf
 
 _COLLISION = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
