@@ -33,6 +33,7 @@ LAYERS = (
     "benchmark",
     "testing",
     "doctor",
+    "bringup",
     "pipeline",
     "cli",
     "__main__",

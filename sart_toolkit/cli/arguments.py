@@ -854,9 +854,42 @@ class Doctor:
     Example: sart doctor
 
     Example: sart doctor --full
+
+    With --robot, say instead whether a robot will work, before anything is recorded: its files,
+    joints, gripper, cameras and home, and how it moves in both simulators.
+
+    Example: sart doctor --robot my_arm.py:MY_ARM --image my_arm.png
     """
 
     full: Annotated[
         bool, arg(help="Also test torch, SAPIEN, windows and devices, which takes longer.")
     ] = False
+    robot: Annotated[str | None, _optional("REF", f"Robot to examine instead, as {_REF}.")] = None
+    image: Annotated[
+        Path | None, _optional("PNG", "Where to write what the robot's cameras see at home.")
+    ] = None
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class NewRobot:
+    """Write a commented RobotSpec file from a URDF, to be completed.
+
+    Example: sart new robot my_arm.urdf --out my_arm.py
+
+    `sart doctor --robot my_arm.py:MY_ARM` then says what is still to be done.
+    """
+
+    urdf: Annotated[
+        Positional[str], arg(metavar="URDF", help="A path, or package:path/inside/it.urdf.")
+    ]
+    out: Annotated[Path, arg(help="Python file to write.")]
+    name: Annotated[
+        str | None, _optional("NAME", "What to call the robot; the file's name if left out.")
+    ] = None
+    package_dirs: Annotated[
+        str | None,
+        _optional("DIRS", "Folders, separated by commas, to look in for package:// meshes."),
+    ] = None
+    overwrite: _OVERWRITE = False
     json: _JSON = False

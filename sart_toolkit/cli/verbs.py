@@ -68,6 +68,7 @@ VERBS: Mapping[str, Verb] = {
     "benchmark skill": Verb(arguments.BenchmarkSkill, "sart_toolkit.cli.benchmark:skill_verb"),
     "info": Verb(arguments.Info, "sart_toolkit.cli.info:info_verb"),
     "doctor": Verb(arguments.Doctor, "sart_toolkit.cli.doctor:doctor_verb"),
+    "new robot": Verb(arguments.NewRobot, "sart_toolkit.cli.new:robot_verb"),
 }
 
 # What an interruption leaves of these is resumed by the same command.
@@ -79,7 +80,7 @@ def find_verb(words: list[str]) -> tuple[str, list[str]]:
 
     Raises:
         UnknownName: there is no such verb; the message offers the nearest.
-        InvalidInput: a benchmark is not named.
+        InvalidInput: it isn't said of what.
     """
     first = {name.partition(" ")[0] for name in VERBS}
     if words[0] not in first:

@@ -64,6 +64,10 @@ class CollisionModel:
     """The convex parts of a robot and of a scene, to be put where their bodies are.
 
     Robot links are convex parts that enclose their collision shapes and what is drawn of them.
+
+    Attributes:
+        overlapping_at_home: pairs of the robot's links, not neighbours, whose parts overlap at its
+            home; nothing is said about these.
     """
 
     def __init__(self, robot: RobotSpec, scene: SceneSpec) -> None:
@@ -98,7 +102,12 @@ class CollisionModel:
         home = _link_poses(self.kinematics)
         self.T_joint_tool = home[robot.tool_frame]
         self._linkage = Linkage(self.kinematics, self._parts)
-        self._self_pairs = self._free_at_home(self._linkage.at(0.0).parts)
+        parts = self._linkage.at(0.0).parts
+        self.overlapping_at_home = self._overlapping_at_home(parts)
+        apart = set(self.overlapping_at_home)
+        self._self_pairs = [
+            (i, j) for i, j in _far_apart(parts) if (parts[i].body, parts[j].body) not in apart
+        ]
 
     def _swept(self, gripper: float | tuple[float, float]) -> Sweep:
         """The robot's parts with its gripper at an opening, or what encloses them over a range."""
@@ -189,25 +198,26 @@ class CollisionModel:
         slip = [excess[i] + excess.get(j, 0.0) for i, j in pairs]
         return PlacedModel(self.kinematics, parts, pairs, self.T_joint_tool, slip, cloud)
 
-    def _free_at_home(self, parts: Sequence[ConvexPart]) -> list[tuple[int, int]]:
-        """Pairs of the robot's parts that can collide: neighbours, and what overlaps at home, not.
-
-        The part that more joints move comes first.
-        """
-        pairs = [
-            (i, j)
-            for i, a in enumerate(parts)
-            for j, b in enumerate(parts)
-            if a.joint - b.joint >= _JOINTS_APART
-        ]
+    def _overlapping_at_home(self, parts: Sequence[ConvexPart]) -> list[tuple[str, str]]:
+        """Links that aren't neighbours and overlap at home, the one that more joints move first."""
+        pairs = _far_apart(parts)
         model = PlacedModel(self.kinematics, parts, pairs, self.T_joint_tool)
-        apart = model.distances(self.robot.home)
-        overlapping = {
+        distances = model.distances(self.robot.home)
+        return sorted({
             (parts[i].body, parts[j].body)
-            for (i, j), distance in zip(pairs, apart, strict=True)
+            for (i, j), distance in zip(pairs, distances, strict=True)
             if distance <= 0
-        }
-        return [(i, j) for i, j in pairs if (parts[i].body, parts[j].body) not in overlapping]
+        })  # fmt: skip
+
+
+def _far_apart(parts: Sequence[ConvexPart]) -> list[tuple[int, int]]:
+    """Pairs of a robot's parts that aren't neighbours; the one that more joints move first."""
+    return [
+        (i, j)
+        for i, a in enumerate(parts)
+        for j, b in enumerate(parts)
+        if a.joint - b.joint >= _JOINTS_APART
+    ]
 
 
 class PlacedModel:

@@ -30,8 +30,8 @@ def straight_line(
     """The motion of the tool in a straight line, in `duration` or as much longer as joints need.
 
     An arm of fewer than six joints follows the line's positions and turns the tool as far as it
-    can. The joint path is a quintic spline through inverse-kinematics solutions on the line, as many as
-    keep the tool within `deviation` of it between them. See `timed` for its course in time.
+    can. The joint path is a quintic spline through inverse-kinematics solutions on the line, as
+    many as keep the tool within `deviation` of it between them. See `timed` for its course in time.
 
     Args:
         model: the robot.

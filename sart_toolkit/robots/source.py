@@ -156,6 +156,13 @@ def parsed(source: Path, content: bytes | None = None) -> ET.Element:
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth
         depth += 1
+        if tag.startswith("xacro:"):
+            name = source.name.partition(".")[0]
+            raise InvalidInput(
+                f"{source.name}: is xacro (it has <{tag}>), from which a URDF is still to be made; "
+                f"type: xacro {source.name} > {name}.urdf (of ROS, or pip install xacro), and give "
+                "that"
+            )
         if depth > _MAX_DEPTH:
             raise BrokenFile(
                 f"{source.name}: not a readable URDF (elements are nested more than {_MAX_DEPTH} "
@@ -175,12 +182,6 @@ def parsed(source: Path, content: bytes | None = None) -> ET.Element:
             "which isn't read); remove it"
         )
 
-    if source.suffix == ".xacro" or b"<xacro:" in content:
-        raise InvalidInput(
-            f"{source.name}: is xacro, from which a URDF is still to be made; type: xacro "
-            f"{source.name} > {source.name.partition('.')[0]}.urdf (of ROS, or pip install "
-            "xacro), and give that"
-        )
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.StartDoctypeDeclHandler = doctype
     try:

@@ -80,11 +80,14 @@ _GRIPPER_PREFIX = "gripper_"
 _MANIFEST = "manifest.json"
 _MESH_TYPES = (".dae", ".glb", ".obj", ".off", ".ply", ".stl")
 _MAX_MESH_BYTES = 100 << 20
-_MAX_EXTENT = 100.0
+# No link is larger [m].
+_MAX_EXTENT = 10.0
 # A link given a mass but no inertia has that of a ball of this radius [m].
 _BALL_RADIUS = 0.05
 # A link that moves and has no mass gets that of its hull at this density [kg/m³].
 _DENSITY = 1000.0
+# So much of an inertia's greatest moment may be rounding.
+_ROUNDING = 1e-6
 _ORIGIN = "world_origin"
 _NOTES = "notes.json"
 
@@ -200,6 +203,23 @@ def source_files(source: Path, package_dirs: Sequence[str] = ()) -> list[Path]:
     return [source, *(path for path in meshes if os.path.isfile(path))]
 
 
+def extents(source: Path, package_dirs: Sequence[str] = ()) -> list[tuple[str, str, float]]:
+    """Each mesh of a URDF: its link, its file's name, and its greatest extent [m], scaled.
+
+    Raises:
+        BrokenFile: the URDF or a mesh can't be read, or a mesh is missing.
+        InvalidInput: a number, shape or reference in it isn't acceptable.
+        MissingExtra: what reads a mesh isn't installed.
+    """
+    found = []
+    for link in source_elements(source, "", package_dirs):
+        for element in link.iter("mesh"):
+            mesh = _loaded(element, source.parent)
+            size = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
+            found.append((link.get("name", ""), Path(element.get("filename", "")).name, size))
+    return found
+
+
 def _intact(directory: Path) -> bool:
     """Whether a folder holds the files that were put there, with the same content."""
     try:
@@ -310,6 +330,11 @@ def _compose(
             mass = float(child_of(inertial, "mass").get("value", ""))
             moment = 0.4 * max(mass, 1e-3) * _BALL_RADIUS**2
             inertial.append(inertia_of(moment * np.eye(3)))
+        elif _made_real(inertial):
+            notes.append(
+                f"link {link.get('name')!r}: no body has its inertia, its greatest moment exceeds "
+                "the sum of the others: these raised"
+            )
     _add_armature(robot, spec)
     ET.indent(robot)
     ET.ElementTree(robot).write(work / "robot.urdf", encoding="utf-8", xml_declaration=True)
@@ -343,6 +368,21 @@ def _weighed(robot: ET.Element, work: Path) -> list[str]:
             f"{_DENSITY:g} kg/m³"
         )
     return notes
+
+
+def _made_real(inertial: ET.Element) -> bool:
+    """Whether an inertia had to be raised to one that a body can have."""
+    element = child_of(inertial, "inertia")
+    rows = [[float(element.get("i" + "".join(sorted(a + b)), 0)) for b in "xyz"] for a in "xyz"]
+    moments, axes = np.linalg.eigh(np.array(rows))
+    lacking = moments[2] - moments[0] - moments[1]
+    # What is only rounded is left as it is.
+    if lacking <= _ROUNDING * moments[2]:
+        return False
+    moments[:2] += lacking / 2 + _ROUNDING * moments[2]
+    inertial.remove(element)
+    inertial.append(inertia_of(axes @ np.diag(moments) @ axes.T))
+    return True
 
 
 def _check_tree(name: str, robot: ET.Element) -> str:
@@ -669,5 +709,6 @@ def _check_mesh(mesh: trimesh.Trimesh, link: str, kind: str, file: str) -> None:
     if np.abs(mesh.vertices).max() > _MAX_EXTENT:
         raise InvalidInput(
             f"{what} reaches {np.abs(mesh.vertices).max():.4g} m from its origin, expected at most "
-            f"{_MAX_EXTENT:g} m; give it a scale"
+            f"{_MAX_EXTENT:g} m; if its file is in millimetres, give its <mesh> "
+            'scale="0.001 0.001 0.001"'
         )
