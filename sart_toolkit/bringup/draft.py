@@ -12,19 +12,23 @@ from pathlib import Path
 import numpy as np
 
 from sart_toolkit.bringup.fingers import fingers_of
+from sart_toolkit.collision.model import CollisionModel
 from sart_toolkit.errors import CannotWrite, InvalidInput, OutputExists, SartError
 from sart_toolkit.poses import Array, log_rotation, pose
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.references import resource_path
 from sart_toolkit.robots.spec import CameraSpec, GripperSpec, RobotSpec, look_at
 from sart_toolkit.robots.urdf import source_elements
+from sart_toolkit.scenes.spec import SceneSpec
 
 _FINGER = re.compile(r"finger|gripper|jaw|claw|knuckle|hand|drive", re.IGNORECASE)
 # A joint that slides farther [m] is that of a base which drives.
 _LONGEST_SLIDE = 3.0
 _ACCELERATION, _JERK = 10.0, 400.0
 _START = np.array([0.45, 0.0, 0.25])
-_TRIES = 60
+_TRIES = 100
+# What of the robot isn't a neighbour is at home so far apart [m].
+_CLEAR = 0.04
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,6 +219,8 @@ def _with_gripper(
         gripper = dataclasses.replace(gripper, open_position=upper, closed_position=lower)
         robot = dataclasses.replace(robot, gripper=gripper)
         found = fingers_of(RobotModel(robot))
+    if found is not None and found.gaps.max() <= 0:
+        doubts.append("the fingers' hulls overlap even open: check which position is closed")
     if found is None or not found.closing.any():
         doubts.append("the tool frame couldn't be told: complete T_gripper_tool")
         return robot
@@ -279,7 +285,9 @@ def _camera(robot: RobotSpec) -> CameraSpec:
 
 def _at_home(robot: RobotSpec, doubts: list[str]) -> RobotSpec:
     """The robot with a home whose tool points down before its base, as far from limits as found."""
-    model = RobotModel(robot)
+    collision = CollisionModel(robot, SceneSpec(()))
+    model = collision.kinematics
+    placed = collision.placed({}, 0.0)
     rng = np.random.default_rng(0)
     inner = np.array([_inner(a, b) for a, b in zip(model.lower, model.upper, strict=True)])
     low, high = np.maximum(inner[:, 0], -np.pi), np.minimum(inner[:, 1], np.pi)
@@ -294,7 +302,7 @@ def _at_home(robot: RobotSpec, doubts: list[str]) -> RobotSpec:
         start = rng.uniform(low, high)
         with contextlib.suppress(SartError):
             q = model.ik(turned, start)
-            if (q < low).any() or (q > high).any():
+            if (q < low).any() or (q > high).any() or placed.too_close(q, _CLEAR):
                 continue
             singular = np.linalg.svd(model.jacobian(q), compute_uv=False)[-1]
             # A home near the joints' middles is also one that a person would choose.
@@ -364,7 +372,7 @@ def _text(robot: RobotSpec, source: str, doubts: Sequence[str]) -> str:
         f"    gripper_base={robot.gripper_base!r},",
         "    # The tool frame: z out between the fingertips, x where the fingers close.",
         f"    T_gripper_tool=sart.pose({_numbers(T[:3, 3])}, {_numbers(log_rotation(T[:3, :3]))}),",
-        "    # complete: where the camera is (z along its view, x right, y down), its field of view.",
+        "    # complete: where the camera is, z along its view, x right, y down; its fov.",
         "    cameras=(",
         "        sart.CameraSpec(",
         f"            {camera.name!r},",

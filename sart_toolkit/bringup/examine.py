@@ -31,6 +31,7 @@ _MASS = 1e-3, 300.0
 # How far [rad or m] a joint may be from its command at rest, and behind it while it moves.
 _AT_REST, _MOVING = 5e-3, 0.02
 _TURN, _SECONDS = 0.15, 2.0
+_GOALS = 16
 _SINGULAR = 0.02
 _SAMPLES = 2000
 _IMAGE = 256
@@ -200,7 +201,13 @@ def _gripper(robot: RobotSpec) -> Iterator[Finding]:
             "check the ratios of its followers, and closed_position", True,
         )  # fmt: skip
         return
-    yield _ok("gripper", f"gap from open to closed: {gaps} mm")
+    if fingers.gaps[0] <= 0:
+        yield _bad(
+            "gripper", f"its fingers' hulls overlap even open ({gaps} mm): the gap can't be told",
+            "look at the image, or give the fingers finer collision shapes",
+        )  # fmt: skip
+    else:
+        yield _ok("gripper", f"gap from open to closed: {gaps} mm")
     if abs(fingers.closing[0]) < 0.9:
         direction = ", ".join(f"{x:.2f}" for x in fingers.closing)
         yield _bad(
@@ -280,7 +287,6 @@ def _physics(robot: RobotSpec) -> Iterator[Finding]:
 def _moved(name: str, robot: RobotSpec) -> Iterator[Finding]:
     """Whether a robot holds its home in a simulator, goes where it is sent, and closes."""
     backend = _backend(name, robot)
-    model = RobotModel(robot)
     hz = backend.rates.control_hz
     touching: set[tuple[str, str]] = set()
 
@@ -307,8 +313,7 @@ def _moved(name: str, robot: RobotSpec) -> Iterator[Finding]:
                 else "raise <limit effort> of the joints, or correct <mass> and <inertia>", True,
             )  # fmt: skip
             return
-        room = np.where(model.upper - robot.home > _TURN, 1.0, -1.0) * _TURN
-        goal = np.clip(robot.home + room, model.lower, model.upper)
+        goal = _goal(robot)
         lagged = go(robot.home, goal, (0.0, 1.0), _SECONDS)
         if not lagged < _MOVING:
             yield _bad(
@@ -328,6 +333,21 @@ def _moved(name: str, robot: RobotSpec) -> Iterator[Finding]:
         yield _ok(name, f"holds to {rested:.1g} rad and follows to {lagged:.1g} rad")
     finally:
         backend.close()
+
+
+def _goal(robot: RobotSpec) -> Array:
+    """Joints `(n,)` a little away from home, all of them, with nothing in the way if there are."""
+    collision = CollisionModel(robot, SceneSpec(()))
+    model, placed = collision.kinematics, collision.placed({}, (0.0, 1.0))
+    rng = np.random.default_rng(0)
+    goal = robot.home
+    for _ in range(_GOALS):
+        turn = _TURN * rng.choice([-1.0, 1.0], len(robot.home))
+        goal = np.clip(robot.home + turn, model.lower, model.upper)
+        way = np.linspace(robot.home, goal, 6)
+        if not any(placed.too_close(q, 0.01) for q in way):
+            break
+    return goal
 
 
 def _backend(name: str, robot: RobotSpec) -> Backend:

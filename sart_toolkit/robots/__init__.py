@@ -16,6 +16,12 @@ if TYPE_CHECKING:
 ROBOTS = {
     "ur5e_2f85": "sart_toolkit.robots.ur5e_2f85:SPEC",
     "ur5e_hande": "sart_toolkit.robots.ur5e_hande:SPEC",
+    "ur3e_2f85": "sart_toolkit.robots.ur3e_2f85:SPEC",
+    "ur10_2f85": "sart_toolkit.robots.ur10_2f85:SPEC",
+    "panda": "sart_toolkit.robots.panda:SPEC",
+    "xarm6": "sart_toolkit.robots.xarm6:SPEC",
+    "xarm7_2f85": "sart_toolkit.robots.xarm7_2f85:SPEC",
+    "iiwa_2f85": "sart_toolkit.robots.iiwa_2f85:SPEC",
 }
 
 

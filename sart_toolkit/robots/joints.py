@@ -36,6 +36,12 @@ def set_joints(spec: RobotSpec, robot: ET.Element) -> list[str]:
         InvalidInput: an arm joint is fixed, has no range, or doesn't follow the one before; a joint
             mimics another in a way that `spec` doesn't have; or the gripper goes beyond its limits.
     """
+    for joint in robot.findall("joint"):
+        # Readers take a fixed joint for a frame, and two of one name for an error.
+        if joint.get("type") == "fixed" and joint.get("name") == child_of(joint, "child").get(
+            "link"
+        ):
+            joint.set("name", f"{joint.get('name')}_joint")
     joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
     linkage = spec.gripper.ratios
     for kind, names in (

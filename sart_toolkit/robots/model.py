@@ -25,7 +25,7 @@ _IK_TOLERANCE = 1e-6
 _IK_MAX_STEP = 0.4
 # An orientation that is far off should not shake the joints of an arm that can't reach it.
 _IK_DAMPING_OF_FEW = 0.03
-# Of its way home, so much of a redundant arm's posture returns in each step of a solution.
+# Of its way home, a redundant arm goes so much with each solution.
 _HOMING = 0.01
 _LIMIT_TOLERANCE = 1e-6
 
@@ -179,15 +179,18 @@ class RobotModel:
         q = np.clip(start, self.lower, self.upper)
         model, data, tool = self._model, self._data, self._tool
         step = self._step if len(start) >= 6 else self._step_of_few
+        # Once: again and again it would keep the rest from converging.
+        home = _HOMING * (self._posture - q) if len(start) > 6 else np.zeros(len(start))
         error = np.zeros(6)
         for _ in range(_IK_STEPS):
             pin.computeJointJacobians(model, data, q)
             pin.updateFramePlacement(model, data, tool)
             J = pin.getFrameJacobian(model, data, tool, pin.ReferenceFrame.LOCAL)
             error = pin.log6(data.oMf[tool].actInv(desired)).vector
-            dq, left = step(J, error, q)
+            dq, left = step(J, error, home)
             if left < _IK_TOLERANCE:
                 break
+            home = np.zeros(len(start))
             largest = np.abs(dq).max()
             if largest > _IK_MAX_STEP:
                 dq *= _IK_MAX_STEP / largest
@@ -207,29 +210,24 @@ class RobotModel:
             )
         return q
 
-    def _step(self, J: Array, error: Array, q: Array) -> tuple[Array, float]:
-        """The joints' next step `(n,)` towards a pose, and how far it is yet."""
-        damped = J @ J.T + _IK_DAMPING**2 * np.eye(6)
-        if len(q) == 6:
-            dq = J.T @ np.linalg.solve(damped, error)
-        else:
-            # What brings the arm home, less what of that moves the tool.
-            home = _HOMING * (self._posture - q)
-            dq = home + J.T @ np.linalg.solve(damped, error - J @ home)
-        return dq, float(np.abs(error).max())
+    def _step(self, J: Array, error: Array, home: Array) -> tuple[Array, float]:
+        """The joints' next step `(n,)` towards a pose, and how far it is yet.
 
-    def _step_of_few(self, J: Array, error: Array, q: Array) -> tuple[Array, float]:
+        `home (n,)` is the way towards a posture, of which what doesn't move the tool is gone.
+        """
+        return home + _damped(J, error - J @ home), float(np.abs(error).max())
+
+    def _step_of_few(self, J: Array, error: Array, home: Array) -> tuple[Array, float]:
         """The same for an arm of fewer than six joints: position first, then what turns it.
 
         `error` is that of a motion by both at once; for the position alone its chord counts.
         """
-        motion = pin.exp6(pin.Motion(error))
-        p, w = motion.translation, error[3:]
+        p = pin.exp6(pin.Motion(error)).translation
         dq = _damped(J[:3], p)
         # What turns the tool about its place.
-        still = np.eye(len(q)) - _damped(J[:3], J[:3])
+        still = np.eye(len(dq)) - _damped(J[:3], J[:3])
         turning = J[3:] @ still
-        more = still @ _damped(turning, w - J[3:] @ dq, _IK_DAMPING_OF_FEW)
+        more = still @ _damped(turning, error[3:] - J[3:] @ dq, _IK_DAMPING_OF_FEW)
         return dq + more, float(max(np.abs(p).max(), np.abs(more).max()))
 
     def reached(self, T_world_tool: Array, q: Array) -> Array:

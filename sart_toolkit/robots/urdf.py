@@ -70,8 +70,10 @@ from sart_toolkit.robots.spec import (
 )
 
 _log = logging.getLogger(__name__)
+# Robots about which a warning was given: one is enough.
+_warned: set[str] = set()
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 14
+_RECIPE = 15
 # What shades and hulls: another version may make other meshes.
 _MADE_WITH = ("trimesh", "scipy", "numpy")
 # Faces that meet at a sharper angle show an edge.
@@ -251,7 +253,8 @@ def _make(
         (made / _MANIFEST).write_text(json.dumps(files, indent=1))
         if _key(spec, attachments, sources) != key:
             raise BrokenFile(f"{spec.name}: its files changed while they were read; try again")
-        if notes:
+        if notes and spec.name not in _warned:
+            _warned.add(spec.name)
             _log.warning(
                 "%s: %s%s; `sart doctor --robot` lists what was assumed",
                 spec.name, notes[0], f", and {len(notes) - 1} more" if notes[1:] else "",
