@@ -25,10 +25,13 @@ _FINGER = re.compile(r"finger|gripper|jaw|claw|knuckle|hand|drive", re.IGNORECAS
 # A joint that slides farther [m] is that of a base which drives.
 _LONGEST_SLIDE = 3.0
 _ACCELERATION, _JERK = 10.0, 400.0
-_START = np.array([0.45, 0.0, 0.25])
+# How far before its base, and at which heights, the tool of an arm of 0.6 m may start [m].
+_START = (0.45, 0.25, 0.45, 0.7)
 _TRIES = 100
 # What of the robot isn't a neighbour is at home so far apart [m].
 _CLEAR = 0.04
+# So far from the joints' limits [rad or m].
+_FROM_LIMITS = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,8 +273,7 @@ def _between(robot: RobotSpec) -> Array:
         assert seen is not None
         tips.append((float(seen.tips[2]), T, seen.tips))
     _, T, tip = max(tips, key=lambda each: each[0])
-    placed = T @ pose(tip - [0, 0, 0.01])
-    return np.asarray(np.round(placed, 6))
+    return np.asarray(T @ pose(tip - [0, 0, 0.01]))
 
 
 def _camera(robot: RobotSpec) -> CameraSpec:
@@ -298,11 +300,12 @@ def _at_home(robot: RobotSpec, doubts: list[str]) -> RobotSpec:
     scale = min(1.0, size / 0.6)
     for i in range(_TRIES):
         turned = np.diag([1.0, -1.0, -1.0, 1.0]) @ pose((0, 0, 0), (0, 0, np.pi / 2 * (i % 4)))
-        turned[:3, 3] = _START * scale
+        turned[:3, 3] = scale * np.array([_START[0], 0.0, _START[i // 4 % len(_START[1:]) + 1]])
         start = rng.uniform(low, high)
         with contextlib.suppress(SartError):
             q = model.ik(turned, start)
-            if (q < low).any() or (q > high).any() or placed.too_close(q, _CLEAR):
+            near = np.minimum(q - model.lower, model.upper - q) < _FROM_LIMITS
+            if near.any() or placed.too_close(q, _CLEAR):
                 continue
             singular = np.linalg.svd(model.jacobian(q), compute_uv=False)[-1]
             # A home near the joints' middles is also one that a person would choose.

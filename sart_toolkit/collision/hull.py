@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array
@@ -66,3 +66,14 @@ class Hull:
         found = np.flatnonzero(inside)
         inside[found] = self.bound(p[found]) <= np.broadcast_to(margin, inside.shape)[found]
         return inside
+
+
+def polyhedron_about(points: Array) -> Array:
+    """Corners `(k, 3)` of a polyhedron of 26 faces, at fixed angles, that encloses points `(n, 3)`.
+
+    The points aren't all in one plane.
+    """
+    normals = np.concatenate([_AXES, -_AXES])
+    farthest = (points @ normals.T).max(axis=0)
+    planes = np.column_stack([normals, -farthest])
+    return np.asarray(HalfspaceIntersection(planes, points.mean(axis=0)).intersections)

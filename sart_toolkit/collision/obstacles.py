@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sart_toolkit.collision.cloud import SceneCloud
-from sart_toolkit.collision.hull import Hull
+from sart_toolkit.collision.hull import Hull, polyhedron_about
 from sart_toolkit.collision.parts import ConvexPart, coal_transform
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, check_array
@@ -178,13 +178,24 @@ def _levels(radii: Array) -> tuple[NDArray[np.intp], Array]:
 def hull_part(name: str, joint: int, points: Array) -> ConvexPart:
     """The convex hull of points `(m, 3)` [m] in a joint's frame, as a part that the joint carries.
 
+    Of points of which too many lie in one plane it is a polyhedron of 26 faces about them.
+
     Raises:
         InvalidInput: fewer than four points, or all in one plane.
     """
     points = check_array(f"points of {name}", points, (None, 3))
     corners = points[Hull(points).corners]
+    try:
+        geometry = _convex(corners)
+    except RuntimeError:
+        # coal has a corner meet 255 others at most.
+        corners = polyhedron_about(corners)
+        geometry = _convex(corners)
+    return ConvexPart(name, joint, geometry, np.eye(4), corners)
+
+
+def _convex(corners: Array) -> coal.CollisionGeometry:
     listed = coal.StdVec_Vec3s()
     for corner in corners:
         listed.append(corner)
-    geometry = coal.ConvexBase.convexHull(listed, False, "Qt")
-    return ConvexPart(name, joint, geometry, np.eye(4), corners)
+    return coal.ConvexBase.convexHull(listed, False, "Qt")
