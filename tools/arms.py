@@ -76,7 +76,7 @@ XARM7_MS = _arm(
 UR3 = _arm(
     "ur3", f"{_ERD}/ur_description/urdf/ur3_robot.urdf",
     list(get_robot("ur5e_2f85").arm_joints), [0, -1.7, 1.9, -1.77, -np.pi / 2, 0], "tool0",
-    pose([0, 0, 0.1]),
+    pose([0, 0, 0.1]), T_world_base=pose([0.18, 0, 0]),
 )  # fmt: skip
 IIWA14 = _arm(
     "iiwa14", "rtbdata:xacro/kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf",

@@ -86,6 +86,7 @@ def _generated(robot: RobotSpec, folder: Path, n: int) -> dict[str, Any]:
 
 
 def main() -> None:
+    """Fill the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--episodes", type=int, default=20, help="of the operator, per simulator")

@@ -290,7 +290,9 @@ class PyBulletBackend(Simulator):
 
     def _place_drawing(self, q: Sequence[float], Ts_world_body: Mapping[str, Array]) -> None:
         """Draw robot and scene where they are now: arm joints `q` [rad], and bodies."""
-        linkage = self._client.getJointStates(self._robot, list(self._gripper.values()))
+        joints = list(self._gripper.values())
+        # Of no joints PyBullet returns nothing.
+        linkage = self._client.getJointStates(self._robot, joints) if joints else ()
         self._open_drawing().place(
             dict(zip(self.robot.arm_joints, q, strict=True)),
             dict(zip(self._gripper, (s[0] for s in linkage), strict=True)),

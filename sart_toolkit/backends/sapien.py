@@ -312,11 +312,6 @@ class _ConvexParts:
         self.spec = spec
         self._urdf = model.urdf
         self.model = pin.buildModelFromUrdf(str(model.urdf))
-        if self.model.nq != self.model.njoints - 1:
-            raise InvalidInput(
-                f"{spec.name}: a joint turns without end, which the sapien backend doesn't know; "
-                "give it limits in the URDF (type revolute)"
-            )
         self._data = self.model.createData()
         self._frames = {frame.name: i for i, frame in enumerate(self.model.frames)}
         index = {name: j for j, name in enumerate(self.model.names)}

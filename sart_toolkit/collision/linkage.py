@@ -43,9 +43,6 @@ class Linkage:
         Args:
             model: the robot, its gripper open.
             parts: its parts there.
-
-        Raises:
-            InvalidInput: a joint of the linkage neither turns within limits nor slides.
         """
         self._parts = tuple(parts)
         self._model = pin.buildModelFromUrdf(str(model.urdf))
@@ -57,13 +54,6 @@ class Linkage:
         closed_at = spec.gripper.joint_positions(1.0)
         for name, open_at in spec.gripper.joint_positions(0.0).items():
             joint = self._model.getJointId(name)
-            kind = self._model.joints[joint].shortname()
-            turns = kind.startswith("JointModelR") and self._model.joints[joint].nq == 1
-            if not (turns or kind.startswith("JointModelP")):
-                raise InvalidInput(
-                    f"{spec.name}: gripper joint {name!r} neither turns within limits nor slides; "
-                    "make it revolute or prismatic"
-                )
             self._open_at[joint] = open_at
             self._rates[joint] = closed_at[name] - open_at
         frames = {frame.name: i for i, frame in enumerate(self._model.frames)}

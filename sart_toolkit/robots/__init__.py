@@ -24,6 +24,9 @@ ROBOTS = {
     "iiwa_2f85": "sart_toolkit.robots.iiwa_2f85:SPEC",
 }
 
+# What backends are tested with: a gripper with a linkage, and one with parallel jaws.
+USUAL_ROBOTS = ("ur5e_2f85", "ur5e_hande")
+
 
 def get_robot(robot: str | RobotSpec) -> RobotSpec:
     """The robot that a name or reference names; a robot itself is returned.

@@ -86,7 +86,12 @@ def mesh_path(reference: str, urdf: Path, package_dirs: Sequence[str] = ()) -> P
             f"{urdf.name}: mesh {reference!r}: is a path of another machine; copy the mesh beside "
             "the URDF and give its path from there"
         )
-    return Path(os.path.normpath(urdf.parent / local_file(text)))
+    try:
+        path = local_file(text)
+    except OSError:
+        # No file system has so long a name.
+        path = Path(text)
+    return Path(os.path.normpath(urdf.parent / path))
 
 
 def where_to_look(reference: str, package_dirs: Sequence[str]) -> str:

@@ -2,7 +2,7 @@
 
     pytest --pyargs sart_toolkit.testing --sart-backend my_package.my_module:MyBackend
 
-runs it with every robot of `ROBOTS`, or with those named by `--sart-robot`. Without options it
+runs it with two of our robots, or with those named by `--sart-robot`. Without options it
 tests our own `BACKENDS`. Tests of an ability that the backend lacks are skipped. `-rs` says why a
 test was skipped: "not judged before test_… passes" means that that one has to be fixed first.
 

@@ -9,7 +9,7 @@ import pytest
 from sart_toolkit.backends import BACKENDS, get_backend
 from sart_toolkit.backends.interface import KnowsBodies, Resets, SensesContacts
 from sart_toolkit.errors import MissingExtra
-from sart_toolkit.robots import ROBOTS
+from sart_toolkit.robots import USUAL_ROBOTS
 from sart_toolkit.scenes.spec import SceneSpec
 from sart_toolkit.testing.bench import Bench, make_bench
 
@@ -21,7 +21,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "target" not in metafunc.fixturenames:
         return
     backends = metafunc.config.getoption("--sart-backend") or list(BACKENDS)
-    robots = metafunc.config.getoption("--sart-robot") or list(ROBOTS)
+    robots = metafunc.config.getoption("--sart-robot") or list(USUAL_ROBOTS)
     targets = [(backend, robot) for backend in backends for robot in robots]
     metafunc.parametrize(
         "target", targets, indirect=True, scope="session", ids=["-".join(t) for t in targets]

@@ -23,7 +23,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="append",
         metavar="NAME",
         help="robot to test it with: one of ROBOTS, module:SPEC or file.py:SPEC; may be "
-        "repeated (default: all ROBOTS)",
+        "repeated (default: one with a linkage, ur5e_2f85, and one with jaws, ur5e_hande)",
     )
 
 

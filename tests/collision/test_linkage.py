@@ -15,7 +15,7 @@ from sart_toolkit.collision.model import CollisionModel
 from sart_toolkit.collision.parts import ConvexPart
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, pose
-from sart_toolkit.robots import ROBOTS, get_robot
+from sart_toolkit.robots import USUAL_ROBOTS, get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import GripperSpec, RobotSpec, Shape
 from sart_toolkit.scenes.spec import Body, SceneSpec
@@ -75,7 +75,7 @@ def check_enclosed(linkage: Linkage, low: float, high: float, rng: np.random.Gen
             assert min(out) <= 1e-9, (part.body, opening)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [*USUAL_ROBOTS, "panda"])
 @pytest.mark.parametrize("ends", RANGES)
 def test_a_sweep_encloses_every_part_at_any_opening_of_its_range(
     robot: str, ends: tuple[float, float], rng: np.random.Generator
@@ -114,7 +114,7 @@ def test_no_point_accelerates_by_more_than_the_bound_and_one_by_a_third_of_it(
     assert linkage._bends[index] / 3 < most <= linkage._bends[index] * (1 + 1e-6)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [*USUAL_ROBOTS, "panda"])
 def test_distances_over_a_range_are_those_of_its_worst_opening_or_hardly_less(
     robot: str, rng: np.random.Generator
 ) -> None:
@@ -153,10 +153,3 @@ def test_what_the_gripper_does_not_move_is_as_it_was() -> None:
 def test_nearly_equal_ranges_share_their_parts() -> None:
     linkage = CollisionModel(get_robot("ur5e_2f85"), SceneSpec(()))._linkage
     assert linkage.over(-0.0058, 0.0063) is linkage.over(-0.0055, 0.0061)
-
-
-def test_a_gripper_joint_that_turns_without_end_is_refused(
-    make_robot: Callable[..., RobotSpec],
-) -> None:
-    with pytest.raises(InvalidInput, match="'gripper_reach' is continuous, expected one with"):
-        CollisionModel(make_robot("revolute", "continuous"), SceneSpec(()))

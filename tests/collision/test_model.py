@@ -18,7 +18,7 @@ from sart_toolkit.collision.model import CollisionModel
 from sart_toolkit.collision.parts import robot_parts
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import pose
-from sart_toolkit.robots import ROBOTS, get_robot
+from sart_toolkit.robots import USUAL_ROBOTS, get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
 from sart_toolkit.scenes.spec import Body, SceneSpec
@@ -313,7 +313,7 @@ def support_point(shape, direction):
 
 
 @pytest.mark.parametrize("gripper", [0.0, 0.37, 1.0])
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [*USUAL_ROBOTS, "panda"])
 def test_parts_enclose_all_collision_geometry_and_are_hardly_larger(robot, gripper, rng):
     placed = CollisionModel(get_robot(robot), SceneSpec(())).placed({}, gripper)
     q = joints_near(placed, rng)
@@ -408,7 +408,7 @@ def test_no_point_is_farther_from_a_joint_than_the_reach(cluttered, seed, kind):
             assert far <= bounds.reach[k, joint - 1] + 1e-9
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [*USUAL_ROBOTS, "panda"])
 def test_fingers_move_with_the_gripper(robot):
     collision = simple(("ball", Shape("sphere", (0.002,))), robot=robot)
     q = collision.robot.home
@@ -449,7 +449,7 @@ def test_all_that_moves_is_compared_with_all_that_stands(cluttered, kind):
                 assert (i, j) not in pairs
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [*USUAL_ROBOTS, "panda"])
 def test_no_pair_of_the_robots_own_overlaps_at_home_at_any_opening(robot):
     collision = CollisionModel(get_robot(robot), SceneSpec(()))
     for gripper in (0.0, 0.3, 0.6, 1.0):
@@ -458,7 +458,7 @@ def test_no_pair_of_the_robots_own_overlaps_at_home_at_any_opening(robot):
         assert placed.distances(placed.kinematics.spec.home).min() > 0.01
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [*USUAL_ROBOTS, "panda"])
 @pytest.mark.parametrize("first", [0.0, 1.0])
 def test_which_pairs_are_considered_does_not_depend_on_the_opening(robot, first):
     collision = CollisionModel(get_robot(robot), SceneSpec(()))
@@ -643,7 +643,7 @@ def test_a_door_is_where_its_pose_says(rng):
 TOO_FAR, TOO_NEAR = 6e-5 + ACCURACY, 5e-6 + ACCURACY
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [*USUAL_ROBOTS, "panda"])
 def test_distances_are_those_of_pybullet(robot, peg_task, rng):
     peg, rod = peg_task.scene.held, Body("rod", (Shape("cylinder", (0.01, 0.2)),), mass=0.1)
     things = [

@@ -23,8 +23,8 @@ from sart_toolkit.robots.enclosure import (
     shape_stands_out,
     standing_out,
 )
-from sart_toolkit.robots.source import links_and_joints
 from sart_toolkit.robots.references import resource_path
+from sart_toolkit.robots.source import links_and_joints
 from sart_toolkit.robots.spec import Shape
 from sart_toolkit.robots.urdf import composed_urdf, drawn_shapes, drawn_triangles, link_parts
 

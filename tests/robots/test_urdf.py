@@ -16,7 +16,7 @@ from sart_toolkit.poses import pose, rpy_pose
 from sart_toolkit.robots import urdf as urdf_module
 from sart_toolkit.robots.references import resource_path
 from sart_toolkit.robots.spec import Attachment, Shape
-from sart_toolkit.robots.urdf import cache_dir, composed_urdf
+from sart_toolkit.robots.urdf import assumptions, cache_dir, composed_urdf
 
 BOX = (Shape("box", (0.02, 0.02, 0.02)),)
 
@@ -417,7 +417,7 @@ def test_a_source_that_is_no_urdf_is_broken_and_leaves_no_files(
 def test_a_source_whose_mesh_is_missing_is_broken(make_tiny, own_cache, tmp_path):
     arm = tmp_path / "arm.urdf"
     arm.write_text(arm.read_text().replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="x.obj"/>'))
-    with pytest.raises(BrokenFile, match="mesh x.obj is missing; reinstall the package"):
+    with pytest.raises(BrokenFile, match="link 'base_link': mesh x.obj is missing; put it there, or correct its"):
         composed_urdf(make_tiny())
     assert list((own_cache / "sart_toolkit").iterdir()) == []
 
@@ -500,9 +500,15 @@ def test_a_collision_mesh_without_a_hull_is_refused(
     assert not list(own_cache.rglob("robot.urdf"))
 
 
-def test_a_link_that_is_drawn_but_does_not_collide_is_refused(make_tiny, tmp_path):
+def test_a_link_that_is_drawn_but_does_not_collide_gets_hulls_of_what_is_drawn(
+    make_tiny, tmp_path
+):
     spec = make_tiny()
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(urdf.read_text().replace("collision>", "visual>", 2))
-    with pytest.raises(InvalidInput, match="link 'base_link': is drawn but has no collision shape"):
-        composed_urdf(spec)
+    composed = composed_urdf(spec)
+    base = ET.parse(composed).getroot().find("link[@name='base_link']")
+    (box,) = base.findall("collision/geometry/box")
+    assert box.get("size") == "0.1 0.1 0.1"
+    (note,) = assumptions(composed)
+    assert note.startswith("link 'base_link' has no collision shape: hulls")
