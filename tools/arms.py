@@ -14,7 +14,7 @@ from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.spec import CameraSpec, GripperSpec, RobotSpec, look_at
 
 _ERD = "example-robot-data:cmeel.prefix/share/example-robot-data/robots"
-_TURNED = pose((0, 0, 0), (0, 0, np.pi / 2))
+_TURNED = pose((0, 0, 0), (0, 0, -np.pi / 2))
 _OUT_OF_X = pose((0, 0, 0), (0, np.pi / 2, 0))
 
 
@@ -56,8 +56,13 @@ _PANDA_HOME = _PANDA.home.tolist()
 # The Panda of two more sources, its gripper closed at 0 in all.
 PANDA_ERD, PANDA_MS = (
     _arm(
-        name, urdf, list(_PANDA.arm_joints), _PANDA_HOME, "panda_hand",
-        _PANDA.T_gripper_tool, _PANDA.gripper,
+        name,
+        urdf,
+        list(_PANDA.arm_joints),
+        _PANDA_HOME,
+        "panda_hand",
+        _PANDA.T_gripper_tool,
+        _PANDA.gripper,
     )  # fmt: skip
     for name, urdf in (
         ("panda_erd", f"{_ERD}/panda_description/urdf/panda.urdf"),
@@ -84,7 +89,7 @@ IIWA14 = _arm(
     pose([0, 0, 0.1], [0, 0, -np.pi / 2]),
 )  # fmt: skip
 Z1 = _arm(
-    "z1", f"{_ERD}/z1_description/urdf/z1.urdf", _XARM7[:6], [0, 1.6, -1.2, 1.17, 0, 0],
+    "z1", f"{_ERD}/z1_description/urdf/z1.urdf", _XARM7[:6], [0, 1.7, -1.2, 1.07, 0, 0],
     "gripperStator", pose([0.17, 0, 0]) @ _OUT_OF_X @ _TURNED,
     GripperSpec(
         driver="jointGripper",
@@ -92,7 +97,7 @@ Z1 = _arm(
         closed_position=0.0,
         finger_links=("gripperMover", "gripperStator"),
     ),
-    T_world_base=pose([0.33, 0, 0.1]),
+    T_world_base=pose([0.24, 0, 0.17]),
 )  # fmt: skip
 KINOVA = _arm(
     "kinova", f"{_ERD}/kinova_description/robots/kinova.urdf",
@@ -103,14 +108,14 @@ KINOVA = _arm(
 SO101 = _arm(
     "so101", f"{_ERD}/so_arm_description/urdf/so101.urdf",
     ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"],
-    [0, 0, 0.3, 1.25, 0], "gripper_frame_link", _TURNED,
+    [0, 0.4, 0.1, 1.07, 0], "gripper_frame_link", _TURNED,
     GripperSpec(
         driver="gripper",
         open_position=1.0,
         closed_position=-0.17,
         finger_links=("moving_jaw_so101_v1_link", "gripper_link"),
     ),
-    T_world_base=pose([0.26, 0, 0.14]),
+    T_world_base=pose([0.25, 0, 0.235]),
 )  # fmt: skip
 # Eight joints, the first of which slides.
 FETCH = _arm(

@@ -32,7 +32,7 @@ from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
 from sart_toolkit.backends.targets import PeriodTargets
 from sart_toolkit.collision.parts import primitive
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
-from sart_toolkit.errors import InvalidInput, MissingCapability, SartError
+from sart_toolkit.errors import MissingCapability, SartError
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import (

@@ -83,7 +83,11 @@ def _files(robot: RobotSpec) -> Iterator[Finding]:
         sizes = extents(resource_path(source), robot.package_dirs)
         meshes += len(sizes)
         for link, mesh, size in sizes:
-            if size > _LONGEST:
+            if not size:
+                yield _bad(
+                    "mesh", f"link {link!r}: {mesh} has no triangles", "export it again", True
+                )
+            elif size > _LONGEST:
                 yield _bad(
                     "mesh size", f"link {link!r}: {mesh} is {size:.4g} m long",
                     'if its file is in millimetres, give its <mesh> scale="0.001 0.001 0.001"',
@@ -209,7 +213,7 @@ def _gripper(robot: RobotSpec) -> Iterator[Finding]:
     else:
         yield _ok("gripper", f"gap from open to closed: {gaps} mm")
     if abs(fingers.closing[0]) < 0.9:
-        direction = ", ".join(f"{x:.2f}" for x in fingers.closing)
+        direction = ", ".join(f"{x:.2f}" for x in np.round(fingers.closing, 2) + 0.0)
         yield _bad(
             "tool frame", f"its fingers close along ({direction}) of it, expected x",
             "turn T_gripper_tool so that x is where the fingers close, and z points out",

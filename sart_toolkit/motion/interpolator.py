@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from ruckig import InputParameter, Result, Ruckig, Synchronization, Trajectory
+from ruckig import InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.poses import Array
@@ -149,7 +149,11 @@ class JointInterpolator:
         # Straight in joint space wherever that can be.
         request.synchronization = Synchronization.Phase
         motion = Trajectory(len(q))
-        result = self._ruckig.calculate(request, motion)
+        try:
+            result = self._ruckig.calculate(request, motion)
+        except RuckigError:
+            # An end from which a joint can't but exceed its limits.
+            return None
         return motion if result in (Result.Working, Result.Finished) else None
 
     def _stays_in_range(self, motion: Trajectory) -> bool:

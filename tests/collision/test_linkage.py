@@ -13,7 +13,6 @@ from sart_toolkit.collision.hull import Hull
 from sart_toolkit.collision.linkage import Linkage
 from sart_toolkit.collision.model import CollisionModel
 from sart_toolkit.collision.parts import ConvexPart
-from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, pose
 from sart_toolkit.robots import USUAL_ROBOTS, get_robot
 from sart_toolkit.robots.model import RobotModel

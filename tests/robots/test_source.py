@@ -229,7 +229,9 @@ def test_a_mesh_that_can_not_be_read_is_reported(make_tiny, tmp_path, file):
     arm.write_text(
         arm.read_text().replace('<box size="0.1 0.1 0.1"/>', f'<mesh filename="{file}"/>')
     )
-    with pytest.raises((BrokenFile, InvalidInput), match="(mesh|robot) .*(missing|expected a file ending)"):
+    with pytest.raises(
+        (BrokenFile, InvalidInput), match="(mesh|robot) .*(missing|expected a file ending)"
+    ):
         composed_urdf(make_tiny())
 
 

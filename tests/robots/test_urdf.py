@@ -417,7 +417,9 @@ def test_a_source_that_is_no_urdf_is_broken_and_leaves_no_files(
 def test_a_source_whose_mesh_is_missing_is_broken(make_tiny, own_cache, tmp_path):
     arm = tmp_path / "arm.urdf"
     arm.write_text(arm.read_text().replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="x.obj"/>'))
-    with pytest.raises(BrokenFile, match="link 'base_link': mesh x.obj is missing; put it there, or correct its"):
+    with pytest.raises(
+        BrokenFile, match="link 'base_link': mesh x.obj is missing; put it there, or correct its"
+    ):
         composed_urdf(make_tiny())
     assert list((own_cache / "sart_toolkit").iterdir()) == []
 
@@ -500,9 +502,7 @@ def test_a_collision_mesh_without_a_hull_is_refused(
     assert not list(own_cache.rglob("robot.urdf"))
 
 
-def test_a_link_that_is_drawn_but_does_not_collide_gets_hulls_of_what_is_drawn(
-    make_tiny, tmp_path
-):
+def test_a_link_that_is_drawn_but_does_not_collide_gets_hulls_of_what_is_drawn(make_tiny, tmp_path):
     spec = make_tiny()
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(urdf.read_text().replace("collision>", "visual>", 2))
