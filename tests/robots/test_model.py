@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 
 from sart_toolkit.errors import InvalidInput, MotionRejected, UnknownName, Unreachable
-from sart_toolkit.poses import check_pose, distance, inverse, pose, relative_motion
+from sart_toolkit.poses import (
+    angle_between,
+    check_pose,
+    distance,
+    inverse,
+    pose,
+    relative_motion,
+)
+from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.references import resource_path
 from sart_toolkit.robots.spec import Attachment, Shape
@@ -249,3 +257,69 @@ def test_a_frame_moves_with_the_tool_stands_still_or_neither(model):
     }  # fmt: skip
     with pytest.raises(UnknownName, match="unknown frame 'forearm'"):
         model.mount_of("forearm")
+
+
+def test_an_arm_of_seven_joints_comes_home_while_its_tool_stays():
+    panda = RobotModel(get_robot("panda"))
+    home = panda.spec.home
+    T = panda.fk(home)
+    # Turned about the line from shoulder to wrist, the tool where it was.
+    away = panda.ik(T, home + [0.3, 0, -0.3, 0, 0.2, 0, 0])
+    assert np.abs(away - home).max() > 0.1
+    off = [float(np.abs(away - home).max())]
+    q = away
+    for i in range(300):
+        moved = T.copy()
+        moved[:3, 3] += 1e-5 * (i % 2)
+        q = panda.ik(moved, q, 0.05)
+        assert np.abs(panda.fk(q) - moved).max() < 2e-6
+        off.append(float(np.abs(q - home).max()))
+    assert off[-1] < 0.2 * off[0]
+
+
+def test_an_arm_of_few_joints_goes_to_the_position_and_turns_as_far_as_it_can(make_tiny, tmp_path):
+    # Yaw, then three joints in a plane: position and pitch are free, roll isn't.
+    def joint(name, parent, child, axis):
+        return (
+            f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="0 0 0.3"/><axis xyz="{axis}"/><limit lower="-3" upper="3"/></joint>'
+        )
+
+    box = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
+    links = "".join(f'<link name="{name}">{box}</link>' for name in "abcd")
+    joints = [joint("yaw", "a", "b", "0 0 1"), joint("lift", "b", "c", "0 1 0")]
+    joints += [joint("bend", "c", "d", "0 1 0"), joint("pitch", "d", "flange", "0 1 0")]
+    (tmp_path / "arm.urdf").write_text(
+        f'<robot name="few">{links}<link name="flange">{box}</link>{"".join(joints)}</robot>'
+    )
+    four = dict.fromkeys(("velocity_limits", "acceleration_limits", "jerk_limits"), np.ones(4))
+    home = np.array([0.2, 0.5, 0.8, 0.4])
+    model = RobotModel(make_tiny(arm_joints=("yaw", "lift", "bend", "pitch"), home=home, **four))
+    reachable = model.fk(home + [0.3, -0.2, 0.1, 0.2])
+    assert np.abs(model.fk(model.ik(reachable, home)) - reachable).max() < 1e-5
+    rolled = reachable @ pose((0, 0, 0), (0.2, 0, 0.3))
+    q = model.ik(rolled, home)
+    reached = model.reached(rolled, q)
+    assert np.abs(reached[:3, 3] - rolled[:3, 3]).max() < 2e-6
+    least = angle_between(reached[:3, :3], rolled[:3, :3])
+    assert 0.05 < least < 0.4
+    # No motion of the joints that keeps the position turns the tool nearer.
+    J = model.jacobian(q)
+    still = np.linalg.svd(J[:3])[2][3:]
+    for way in (*still, *-still):
+        try:
+            near = model.fk(model.ik(model.fk(q + 1e-3 * way), q + 1e-3 * way))
+        except Unreachable:
+            continue
+        assert angle_between(near[:3, :3], rolled[:3, :3]) > least - 1e-5
+    with pytest.raises(Unreachable, match="is out of reach"):
+        model.ik(pose([9.0, 0, 0]), home)
+
+
+def test_limits_of_a_joint_that_slides_are_in_metres(make_tiny, tmp_path):
+    arm = tmp_path / "arm.urdf"
+    arm.write_text(
+        arm.read_text().replace('name="wrist" type="revolute"', 'name="wrist" type="prismatic"')
+    )
+    with pytest.raises(InvalidInput, match="wrist: 2.500 m is outside its limits"):
+        RobotModel(make_tiny()).check_limits(np.array([0.0, 2.5]))
