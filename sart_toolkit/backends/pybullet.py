@@ -197,10 +197,11 @@ class PyBulletBackend(Simulator):
         self._gripper = {name: joints[name] for name in robot.gripper.joint_positions(0.0)}
         self._driver = joints[robot.gripper.driver]
         self._followers = {joints[n]: ratio for n, ratio in robot.gripper.followers.items()}
-        tool_link, self._T_link_tool = bodies.frames.get(
-            robot.tool_frame, (robot.tool_frame, np.eye(4))
-        )
-        self._tool_link = self._links[tool_link]
+        # On which link, and where there, are the tool and what it holds.
+        self._at_tool: dict[str, tuple[int, Array]] = {}
+        for name in (robot.tool_frame, *(body.name for body in self.scene.held)):
+            link, T_link_frame = bodies.frames.get(name, (name, np.eye(4)))
+            self._at_tool[name] = self._links[link], T_link_frame
         self._forces = [c.getJointInfo(self._robot, j)[10] for j in self._arm]
         for link in robot.gripper.finger_links:
             c.changeDynamics(self._robot, self._links[link], lateralFriction=1.0)
@@ -305,11 +306,11 @@ class PyBulletBackend(Simulator):
     def _poses(self) -> tuple[Array, dict[str, Array]]:
         """Where the tool is, and where the bodies are."""
         c = self._client
-        links = [self._tool_link, *(self._links[body.name] for body in self.scene.held)]
-        T_world_link, *held = (
-            _matrix(state[4], state[5]) for state in c.getLinkStates(self._robot, links, 0, 1)
+        links, Ts_link_frame = zip(*self._at_tool.values(), strict=True)
+        states = c.getLinkStates(self._robot, links, 0, 1)
+        T_world_tool, *held = (
+            _matrix(state[4], state[5]) @ T for state, T in zip(states, Ts_link_frame, strict=True)
         )
-        T_world_tool = T_world_link @ self._T_link_tool
         Ts = {body.name: T for body, T in zip(self.scene.held, held, strict=True)}
         for name, (index, link) in self._bodies.items():
             if link >= 0:
