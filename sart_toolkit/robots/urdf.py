@@ -73,12 +73,14 @@ _log = logging.getLogger(__name__)
 # Robots about which a warning was given: one is enough.
 _warned: set[str] = set()
 # Bump when the composition changes, so that cached files of an older version are not used.
-_RECIPE = 15
+_RECIPE = 16
 # What shades and hulls: another version may make other meshes.
 _MADE_WITH = ("trimesh", "scipy", "numpy")
 # Faces that meet at a sharper angle show an edge.
 _CREASE_DEG = 30.0
 _GRIPPER_PREFIX = "gripper_"
+# What a link of no mass of its own gets [kg].
+FRAME_MASS = 1e-3
 _MANIFEST = "manifest.json"
 _MESH_TYPES = (".dae", ".glb", ".obj", ".off", ".ply", ".stl")
 _MAX_MESH_BYTES = 100 << 20
@@ -328,7 +330,7 @@ def _compose(
         inertial = link.find("inertial")
         if inertial is None:
             # A simulator would give a link without inertia one kilogram.
-            link.append(inertial_of(1e-3, np.zeros(3), 1e-6 * np.eye(3)))
+            link.append(inertial_of(FRAME_MASS, np.zeros(3), 1e-6 * np.eye(3)))
         elif inertial.find("inertia") is None:
             mass = float(child_of(inertial, "mass").get("value", ""))
             moment = 0.4 * max(mass, 1e-3) * _BALL_RADIUS**2
