@@ -5,11 +5,21 @@ from __future__ import annotations
 import shutil
 import xml.etree.ElementTree as ET
 
+import coal
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from sart_toolkit.collision.model import CollisionModel
-from sart_toolkit.collision.parts import ConvexPart, coal_geometry, primitive, robot_parts
+from sart_toolkit.collision.obstacles import hull_part
+from sart_toolkit.collision.parts import (
+    ConvexPart,
+    coal_geometry,
+    coal_transform,
+    convex_distance,
+    primitive,
+    robot_parts,
+)
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.poses import pose
 from sart_toolkit.robots import get_robot
@@ -115,3 +125,18 @@ def test_no_pair_of_links_goes_unchecked_for_the_size_of_its_parts(robot):
     assert checked == {
         (a.body, b.body) for a in placed.parts for b in placed.parts if a.joint - b.joint >= 2
     }
+
+
+def test_a_hull_of_which_too_much_is_flat_is_enclosed_all_the_same():
+    angles = np.linspace(0, 2 * np.pi, 900, endpoint=False)
+    # A disc whose rim is all in one plane, and a tip that each of its corners meets.
+    rim = np.stack([0.05 * np.cos(angles), 0.05 * np.sin(angles), np.zeros(900)], axis=1)
+    points = np.concatenate([rim, [[0, 0, 0.1]]])
+    part = hull_part("disc", 1, points)
+    hull = ConvexHull(part.points)
+    assert (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max() < 1e-9
+    assert hull.volume < 2 * ConvexHull(points).volume
+    # coal computes with it.
+    ball, far = coal.Sphere(0.01), pose([0.2, 0, 0])
+    found = convex_distance(part.geometry, coal_transform(np.eye(4)), ball, coal_transform(far))
+    assert 0.12 < found <= 0.14

@@ -12,7 +12,7 @@ from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 
 
-@pytest.fixture(params=[*ROBOTS, "with a peg"])
+@pytest.fixture(params=[*USUAL_ROBOTS, "panda", "with a peg"])
 def model(request: pytest.FixtureRequest) -> RobotModel:
     if request.param == "with a peg":
         task = get_task("peg_in_hole")
