@@ -13,6 +13,7 @@ import json
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,14 +86,14 @@ def _generated(robot: RobotSpec, folder: Path, n: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> int:
     """Fill the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--episodes", type=int, default=20, help="of the operator, per simulator")
     parser.add_argument("-n", type=int, default=20, help="trajectories to generate")
     parser.add_argument("--robots", help="names, separated by commas; all if left out")
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     robots = [get_robot(name) for name in ROBOTS] + list(ARMS)
     chosen = options.robots.split(",") if options.robots else [robot.name for robot in robots]
     rows = json.loads(options.out.read_text())["robots"] if options.out.exists() else {}
@@ -108,7 +109,8 @@ def main() -> None:
         settings = {"task": TASK, "episodes": options.episodes, "n": options.n}
         write_json(options.out, {**settings, "robots": rows, "versions": library_versions()})
         print(robot.name, json.dumps(rows[robot.name]), file=sys.stderr, flush=True)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
