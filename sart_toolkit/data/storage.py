@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import glob
 import hashlib
 import io
 import json
@@ -126,6 +127,46 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(temporary, real)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing_directory(path: Path, mark: str, overwrite: bool = False) -> Iterator[Path]:
+    """An empty directory beside `path` that becomes `path` when the block ends without an error.
+
+    What a process that was killed has left of an earlier one is removed.
+
+    Args:
+        path: the directory; no other process can write it meanwhile.
+        mark: the file that such a directory holds; one without it is never replaced.
+        overwrite: whether such a directory may be replaced.
+
+    Raises:
+        OutputExists: it is there and may not be replaced.
+        CannotWrite: the disk refuses, or another process is at work on it; `path` is as it was.
+    """
+    path = Path(path)
+    with OutputLock(path):
+        check_replaceable(path, mark, overwrite)
+        with _cannot_write(path):
+            real = linked(path)
+            for left in real.parent.glob(f".{glob.escape(real.name)}.*"):
+                if left.is_dir() and _TEMPORARY.fullmatch(left.name):
+                    shutil.rmtree(left)
+            temporary = Path(tempfile.mkdtemp(dir=real.parent, prefix=f".{real.name}."))
+            try:
+                yield temporary
+                for inside in temporary.rglob("*"):
+                    if inside.is_file():
+                        with open(inside, "rb+") as file:
+                            os.fsync(file.fileno())
+                umask = os.umask(0)
+                os.umask(umask)
+                os.chmod(temporary, 0o777 & ~umask)
+                if real.exists():
+                    shutil.rmtree(real)
+                os.replace(temporary, real)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
 
 
 def link_file(source: Path, target: Path) -> None:
