@@ -53,6 +53,8 @@ VERBS: Mapping[str, Verb] = {
     "validate": Verb(arguments.Validate, "sart_toolkit.cli.augment:validate_verb"),
     "merge": Verb(arguments.Merge, "sart_toolkit.cli.combine:merge_verb"),
     "split": Verb(arguments.Split, "sart_toolkit.cli.combine:split_verb"),
+    "export": Verb(arguments.Export, "sart_toolkit.cli.formats:export_verb"),
+    "import": Verb(arguments.Import, "sart_toolkit.cli.formats:import_verb"),
     "train": Verb(arguments.Train, "sart_toolkit.cli.train:train_verb"),
     "evaluate": Verb(arguments.Evaluate, "sart_toolkit.cli.train:evaluate_verb"),
     "report": Verb(arguments.Report, "sart_toolkit.cli.run:report_verb"),

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit.data.dataset import Dataset, Source, count_demonstrations
+from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.records import (
     CameraFrame,
     CameraRecord,
@@ -24,7 +25,7 @@ from sart_toolkit.data.records import (
     actions_from_commands,
     library_versions,
 )
-from sart_toolkit.errors import InvalidInput
+from sart_toolkit.errors import BrokenFile, InvalidInput
 from sart_toolkit.poses import Array
 
 ACTION_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
@@ -137,8 +138,8 @@ class Given:
     cameras: Mapping[str, tuple[CameraFrame, Array]] = dataclasses.field(default_factory=dict)
 
 
-class Reads(abc.ABC):
-    """A format that can be imported."""
+class Reads(Format):
+    """A format that can be imported as well."""
 
     @abc.abstractmethod
     def recordings(self, path: Path) -> Sequence[Path]:
@@ -156,6 +157,29 @@ class Reads(abc.ABC):
             BrokenFile: it can't be read.
             InvalidInput: something is neither in the file nor given; the message says how to.
         """
+
+
+def reader_of(path: Path, format: Format | None) -> tuple[Reads, Sequence[Path]]:
+    """What reads a path, and the single recordings in it.
+
+    Args:
+        path: a recording, or a directory of several.
+        format: what it is; found out if left out.
+
+    Raises:
+        InvalidInput: the format isn't read.
+        BrokenFile: there is no recording of the format, or of any that is read.
+    """
+    formats = [format] if format is not None else [get_format(name) for name in FORMATS]
+    readers = [each for each in formats if isinstance(each, Reads)]
+    if not readers:
+        names = ", ".join(n for n in FORMATS if isinstance(get_format(n), Reads))
+        raise InvalidInput(f"format {formats[0].name}: isn't imported; those that are: {names}")
+    for reader in readers:
+        if found := reader.recordings(path):
+            return reader, found
+    names = ", ".join(reader.name for reader in readers)
+    raise BrokenFile(f"{path}: holds no recording of {names}; check the path")
 
 
 # --- what is exported ---------------------------------------------------------------------------

@@ -12,7 +12,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from sart_toolkit.data.storage import put_frames
 from sart_toolkit.errors import BrokenFile
 
 # What damaged files make HDF5's library raise.
@@ -120,11 +119,6 @@ class Hdf5Output:
         """
         self.file.flush()
         self._shielded.check()
-
-
-def put_images(group: h5py.Group, name: str, images: NDArray[Any]) -> None:
-    """Write images `(n, H, W)` or `(n, H, W, k)`, packed losslessly, one by one."""
-    put_frames(group, name, images)
 
 
 @contextlib.contextmanager

@@ -30,7 +30,12 @@ from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array
 
 VERSION = "v3.0"
-INFO, STATS, TASKS, SIDE = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/sart.json"
+INFO, STATS, TASKS, SIDE = (
+    "meta/info.json",
+    "meta/stats.json",
+    "meta/tasks.parquet",
+    "meta/sart.json",
+)
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 EPISODES = f"meta/episodes/{_FILE}.parquet"
 DATA = f"data/{_FILE}.parquet"
@@ -351,7 +356,7 @@ class _Writer:
             own.add(values)
             statistics[name] = own.result()
         for name, camera in trajectory.steps.cameras.items():
-            pictures = {f"observation.images.{name}": camera.rgb}
+            pictures: dict[str, NDArray[Any]] = {f"observation.images.{name}": camera.rgb}
             if self._about.depth:
                 pictures[f"observation.images.{name}_depth"] = depth_levels(camera.depth)
             for key, frames in pictures.items():

@@ -188,9 +188,7 @@ class _Check:
                     chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
                 )
                 places.setdefault(path, []).append(i)
-        found = {
-            str(path.relative_to(self._root)) for path in self._root.glob("data/*/*.parquet")
-        }
+        found = {str(path.relative_to(self._root)) for path in self._root.glob("data/*/*.parquet")}
         for name in sorted(found - set(places)):
             yield f"{name}: no episode of meta/episodes is in it"
         end = 0

@@ -7,11 +7,11 @@ dataset that others leave aside, what RMB has no place for; of those of others, 
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import io
 import json
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 
 from sart_toolkit.data.formats.format import (
     About,
-    Format,
     Given,
     Reads,
     Trajectory,
@@ -62,7 +61,7 @@ _RGB = Codec("libx264rgb", "h264", "rgb24", "rgb24", {"crf": "0", "preset": "ver
 _DEPTH = Codec("libx264", "h264", "yuv444p", "yuv444p", {"crf": "0", "preset": "veryfast"})
 
 
-class Rmb(Format, Reads):
+class Rmb(Reads):
     """RMB, a directory of recordings, each an `X.rmb`."""
 
     name = "rmb"
@@ -131,21 +130,14 @@ class RmbHdf5(Rmb):
                     put_frames(file, f"{name}_depth_image", camera.depth)
 
 
-class _hdf5:  # noqa: N801 - used as a function
+@contextlib.contextmanager
+def _hdf5(path: Path) -> Iterator[h5py.File]:
     """A small HDF5 file, made in memory: HDF5 crashes the process where a disk fills up."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._content = path, io.BytesIO()
-        self._file = h5py.File(self._content, "w")
-
-    def __enter__(self) -> h5py.File:
-        return self._file
-
-    def __exit__(self, failed: type[BaseException] | None, *_: object) -> None:
-        self._file.close()
-        if failed is None:
-            with self._content.getbuffer() as content:
-                self._path.write_bytes(content)
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        yield file
+    with content.getbuffer() as all_:
+        path.write_bytes(all_)
 
 
 def _video(path: Path, camera: str, kind: str) -> Path:

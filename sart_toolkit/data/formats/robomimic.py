@@ -18,7 +18,8 @@ from sart_toolkit.data.formats.format import (
     Trajectory,
     quaternions,
 )
-from sart_toolkit.data.formats.hdf5 import Hdf5Output, put_images, reading_hdf5
+from sart_toolkit.data.formats.hdf5 import Hdf5Output, reading_hdf5
+from sart_toolkit.data.storage import put_frames
 from sart_toolkit.errors import BrokenFile, InvalidInput
 from sart_toolkit.poses import Array
 
@@ -106,9 +107,9 @@ def _put(demo: h5py.Group, trajectory: Trajectory, about: About) -> None:
     obs["robot0_eef_quat"] = quaternions(poses, real="last")
     obs["robot0_gripper_qpos"] = steps.measured_gripper[:, None]
     for name, camera in steps.cameras.items():
-        put_images(obs, f"{name}_image", camera.rgb)
+        put_frames(obs, f"{name}_image", camera.rgb)
         if about.depth:
-            put_images(obs, f"{name}_depth", camera.depth[..., None])
+            put_frames(obs, f"{name}_depth", camera.depth[..., None])
     if not np.isfinite(trajectory.actions).all():
         raise InvalidInput(f"{trajectory.name}: actions have NaN or infinite values; leave it out")
     demo["actions"] = trajectory.actions.astype(np.float64)
@@ -192,4 +193,3 @@ def _demo_problems(
             f"data/{name}: actions lie outside [-1, 1], the first at step {step}, value {value}: "
             f"{actions[step, value]:.4g}"
         )
-

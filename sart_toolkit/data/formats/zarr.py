@@ -31,7 +31,8 @@ from sart_toolkit.errors import BrokenFile
 
 # So large are the chunks that Diffusion Policy writes itself, uncompressed.
 _CHUNK_BYTES = 2 * 2**20
-_COMPRESSOR = {"id": "zlib", "level": 1}
+_LEVEL = 1
+_COMPRESSOR = {"id": "zlib", "level": _LEVEL}
 _ENDS = "meta/episode_ends"
 
 
@@ -129,7 +130,7 @@ class _Array:
         chunk[: len(now)] = now
         number = self._n_written // self._rows
         key = ".".join(map(str, (number, *(0 for _ in self._row))))
-        packed = isal_zlib.compress(chunk, _COMPRESSOR["level"])
+        packed = isal_zlib.compress(chunk, _LEVEL)
         (self._path / key).write_bytes(packed)
         self._n_written += len(now)
         # A copy, so that what is written goes from memory.
@@ -164,11 +165,11 @@ def _write(path: Path, value: Mapping[str, Any]) -> None:
 
 def _problems(root: Path) -> Iterator[str]:
     for group in (".", "data", "meta"):
-        name = Path(group) / ".zgroup"
-        if not (root / name).exists():
-            yield f"{name}: no such file"
-        elif (version := _json(root, name).get("zarr_format")) != 2:
-            yield f"{name}: zarr_format is {version!r}, expected 2"
+        about = Path(group) / ".zgroup"
+        if not (root / about).exists():
+            yield f"{about}: no such file"
+        elif (version := _json(root, about).get("zarr_format")) != 2:
+            yield f"{about}: zarr_format is {version!r}, expected 2"
     if not (root / _ENDS / ".zarray").exists():
         yield f"{_ENDS}: no such array"
         return
@@ -188,15 +189,14 @@ def _problems(root: Path) -> Iterator[str]:
     if not names:
         yield "data: has no array"
     for name in names:
-        about = _json(root, Path("data") / name / ".zarray")
-        wrong = list(_array_problems(root, f"data/{name}", about))
+        described = _json(root, Path("data") / name / ".zarray")
+        wrong = list(_array_problems(root, f"data/{name}", described))
         yield from wrong
-        if not wrong and about["shape"][0] != ends[-1]:
-            yield (
-                f"data/{name}: has {about['shape'][0]} rows, the last of {_ENDS} is {int(ends[-1])}"
-            )
-        if not wrong and np.dtype(about["dtype"]).kind == "f":
-            for key, chunk in _chunks(root, f"data/{name}", about):
+        if not wrong and described["shape"][0] != ends[-1]:
+            n = described["shape"][0]
+            yield f"data/{name}: has {n} rows, the last of {_ENDS} is {int(ends[-1])}"
+        if not wrong and np.dtype(described["dtype"]).kind == "f":
+            for key, chunk in _chunks(root, f"data/{name}", described):
                 if not np.isfinite(chunk).all():
                     yield f"data/{name}/{key}: has NaN or infinite values"
                     break
@@ -247,9 +247,7 @@ def _chunk_keys(shape: Sequence[int], chunks: Sequence[int]) -> Iterator[str]:
         yield ".".join(map(str, index))
 
 
-def _chunks(
-    root: Path, name: str, about: Mapping[str, Any]
-) -> Iterator[tuple[str, NDArray[Any]]]:
+def _chunks(root: Path, name: str, about: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
     """The chunks of an array by their keys; none where it isn't packed as ours are."""
     if about.get("compressor") not in (None, _COMPRESSOR) or about.get("filters"):
         return
