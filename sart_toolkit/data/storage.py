@@ -163,8 +163,13 @@ def replacing_directory(path: Path, mark: str, overwrite: bool = False) -> Itera
                 os.umask(umask)
                 os.chmod(temporary, 0o777 & ~umask)
                 if real.exists():
-                    shutil.rmtree(real)
-                os.replace(temporary, real)
+                    # Out of the way first: removing it takes time, renaming none.
+                    old = Path(tempfile.mkdtemp(dir=real.parent, prefix=f".{real.name}."))
+                    os.replace(real, old)
+                    os.replace(temporary, real)
+                    shutil.rmtree(old)
+                else:
+                    os.replace(temporary, real)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
 

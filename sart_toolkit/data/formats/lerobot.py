@@ -56,7 +56,7 @@ RGB_CODECS = (
 DEPTH_CODECS = (
     Codec(
         "libx265", "hevc", "gray12le", "gray12le",
-        {**_GOP, "preset": "fast", "x265-params": "lossless=1:log-level=none:pools=none"},
+        {**_GOP, "preset": "fast", "x265-params": "lossless=1:bframes=0:log-level=none:pools=none"},
     ),
 )  # fmt: skip
 # Depth is stored as one of 4096 levels that are even in log(depth + shift), all in metres.
@@ -192,7 +192,7 @@ class _Video:
     def add(self, frames: NDArray[Any]) -> tuple[dict[str, Any], dict[str, Array]]:
         """Where an episode's frames stand in the files, and their statistics."""
         writer = self._writer
-        if writer is None or writer.n_bytes > self._limit:
+        if writer is None or writer.n_bytes >= self._limit:
             self._close()
             self.file += 1
             path = self._root / VIDEOS.format(video_key=self.key, **place(self.file))

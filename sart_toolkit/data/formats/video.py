@@ -51,7 +51,7 @@ class Codec:
         av = required("av")
         try:
             av.codec.Codec(self.name, "w")
-        except av.FFmpegError:
+        except (av.FFmpegError, ValueError):
             return False
         return True
 
