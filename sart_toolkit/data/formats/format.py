@@ -217,6 +217,7 @@ def _demonstrated(name: str, demonstration: Demonstration) -> Trajectory:
         "device": demonstration.device,
         "seed": demonstration.seed,
         "judged_by": demonstration.judged_by,
+        "cameras": _cameras(demonstration.steps),
     }
     return Trajectory(
         name,
@@ -238,11 +239,24 @@ def _generated(name: str, episode: Episode, demonstration: Demonstration) -> Tra
         **dataclasses.asdict(at),
         "T_world_sampled": at.T_world_sampled.tolist(),
         "task_parameters": dict(demonstration.task_parameters),
+        # With varied appearance, each demonstration has its own mounting.
+        "cameras": _cameras(steps),
     }
     success = np.concatenate([np.zeros(len(episode), bool), demonstration.success[after]])
     timestamps = np.arange(len(steps)) / demonstration.rates.record_hz
     actions = actions_from_commands(steps.commanded_Ts_world_tool, steps.commanded_gripper)
     return Trajectory(name, steps, actions, success, timestamps, provenance)
+
+
+def _cameras(steps: Steps) -> dict[str, Any]:
+    return {
+        name: {
+            "intrinsics": camera.intrinsics.tolist(),
+            "frame": camera.frame,
+            "T_frame_camera": camera.T_frame_camera.tolist(),
+        }
+        for name, camera in steps.cameras.items()
+    }
 
 
 def joined(first: Steps, second: Steps, after: slice) -> Steps:
@@ -302,14 +316,7 @@ def about_dataset(
         "backend": first.backend,
         "references": dict(first.references),
         "rates": dataclasses.asdict(first.rates),
-        "cameras": {
-            name: {
-                "intrinsics": camera.intrinsics.tolist(),
-                "frame": camera.frame,
-                "T_frame_camera": camera.T_frame_camera.tolist(),
-            }
-            for name, camera in first.steps.cameras.items()
-        },
+        "cameras": _cameras(first.steps),
         "content_hash": identity,
         "sources": sources,
         "versions": library_versions(),

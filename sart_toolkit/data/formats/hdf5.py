@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from sart_toolkit.errors import BrokenFile
+from sart_toolkit.errors import BrokenFile, SartError
 
 # What damaged files make HDF5's library raise.
 _ERRORS = (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError)
@@ -131,7 +131,7 @@ def reading_hdf5(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except BrokenFile:
+    except SartError:
         raise
     except _ERRORS as error:
         raise BrokenFile(f"{path}: can't be read as such a file ({error})") from error

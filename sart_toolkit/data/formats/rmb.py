@@ -368,7 +368,7 @@ class _Recording:
             _log.warning("%s: camera %r has no depth: as if nothing was hit", self._path, name)
             depth = np.zeros(rgb.shape[:3], np.float32)
         frame: CameraFrame
-        ours = self._ours.get("cameras", {}).get(name)
+        ours = self._ours.get("provenance", {}).get("cameras", {}).get(name)
         if ours is not None:
             frame, T, intrinsics = ours["frame"], ours["T_frame_camera"], ours["intrinsics"]
         elif name in self._given.cameras:
