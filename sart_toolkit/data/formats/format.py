@@ -358,6 +358,22 @@ def quaternions(Ts: Array, real: Literal["first", "last"]) -> Array:
     return np.asarray(found)
 
 
+def all_problems(lines: Iterator[str]) -> list[str]:
+    """The lines, and another where what is checked is so odd that it can't be checked further."""
+    found = []
+    try:
+        for line in lines:
+            found.append(line)
+    except BrokenFile as error:
+        found.append(str(error))
+    except (
+        OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError,
+        MemoryError,
+    ) as error:  # fmt: skip
+        found.append(f"can't be made sense of ({type(error).__name__}: {error}); write it again")
+    return found
+
+
 # Called with (trajectories done, trajectories in all).
 Progress = Callable[[int, int], None]
 

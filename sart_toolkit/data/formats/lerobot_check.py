@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sart_toolkit.data.formats.format import all_problems
 from sart_toolkit.data.formats.lerobot import INFO, STATS, TASKS, VERSION
 from sart_toolkit.data.formats.statistics import STATISTICS
 from sart_toolkit.data.formats.video import inspect_video, required
@@ -27,7 +28,7 @@ _TYPES = {"float32", "float64", "int64", "int32", "bool", "string", "video", "im
 
 def problems(path: Path) -> list[str]:
     """What is wrong with a dataset directory, a line each, the file named first."""
-    return list(_Check(Path(path)).run())
+    return all_problems(_Check(Path(path)).run())
 
 
 class _Check:

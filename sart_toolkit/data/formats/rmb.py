@@ -25,6 +25,7 @@ from sart_toolkit.data.formats.format import (
     Given,
     Reads,
     Trajectory,
+    all_problems,
     quaternions,
 )
 from sart_toolkit.data.formats.hdf5 import reading_hdf5, rows
@@ -96,7 +97,7 @@ class Rmb(Reads):
         found = self.recordings(path)
         if not found:
             return [f"{path}: no recording of RMB"]
-        return [line for each in found for line in _recording_problems(each)]
+        return all_problems(line for each in found for line in _recording_problems(each))
 
     def recordings(self, path: Path) -> Sequence[Path]:
         path = Path(path)

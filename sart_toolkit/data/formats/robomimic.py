@@ -16,11 +16,12 @@ from sart_toolkit.data.formats.format import (
     About,
     Format,
     Trajectory,
+    all_problems,
     quaternions,
 )
 from sart_toolkit.data.formats.hdf5 import Hdf5Output, reading_hdf5
 from sart_toolkit.data.storage import put_frames
-from sart_toolkit.errors import BrokenFile, InvalidInput
+from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array
 
 # robomimic's number for an environment of Gym.
@@ -72,11 +73,7 @@ class Robomimic(Format):
             data.attrs["sart"] = json.dumps(about.sart)
 
     def problems(self, path: Path) -> Sequence[str]:
-        try:
-            with reading_hdf5(path) as file:
-                return list(_problems(file))
-        except BrokenFile as error:
-            return [str(error)]
+        return all_problems(_file_problems(Path(path)))
 
 
 def _scaling(greatest: Array) -> tuple[Array, Array]:
@@ -119,6 +116,11 @@ def _put(demo: h5py.Group, trajectory: Trajectory, about: About) -> None:
     demo.attrs["num_samples"] = n
     demo.attrs["model_file"] = ""
     demo.attrs["sart"] = json.dumps({"name": trajectory.name, **trajectory.provenance})
+
+
+def _file_problems(path: Path) -> Iterator[str]:
+    with reading_hdf5(path) as file:
+        yield from _problems(file)
 
 
 def _problems(file: h5py.File) -> Iterator[str]:

@@ -24,6 +24,7 @@ from sart_toolkit.data.formats.format import (
     About,
     Format,
     Trajectory,
+    all_problems,
     pose_rows,
 )
 from sart_toolkit.data.storage import parse_json
@@ -75,10 +76,7 @@ class ZarrReplayBuffer(Format):
         _write(path / "sart_episodes.json", {"episodes": told})
 
     def problems(self, path: Path) -> Sequence[str]:
-        try:
-            return list(_problems(Path(path)))
-        except BrokenFile as error:
-            return [str(error)]
+        return all_problems(_problems(Path(path)))
 
 
 def _rows_of(trajectory: Trajectory, about: About) -> dict[str, NDArray[Any]]:

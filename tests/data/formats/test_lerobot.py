@@ -400,6 +400,10 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda root: (root / EPISODES).write_bytes(b"nothing"),
         f"{EPISODES}: can't be read as parquet",
     ),
+    "a description that makes no sense": (
+        lambda root: edit_json(root, INFO, lambda info: info.update(data_path=3)),
+        "can't be made sense of (AttributeError: ",
+    ),
     "no description": (lambda root: (root / INFO).unlink(), f"{INFO}: no such file"),
     "a split of more episodes": (
         lambda root: edit_json(root, INFO, lambda info: info.update(splits={"train": "0:9"})),
