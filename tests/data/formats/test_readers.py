@@ -26,6 +26,8 @@ pytestmark = pytest.mark.slow
 
 # A Python that has lerobot >= 0.6; it needs Python 3.12 or later and another torch than ours.
 LEROBOT_PYTHON = "SART_LEROBOT_PYTHON"
+# A Python that has robomimic.
+ROBOMIMIC_PYTHON = "SART_ROBOMIMIC_PYTHON"
 # What lerobot-doctor says that is so, of few and short episodes of one task.
 FACTS = (
     r"zero variance \(constant value",
@@ -132,6 +134,45 @@ def test_a_lerobot_reader_draws_every_frame_exactly(dataset_of, tmp_path):
     assert found["depth"] <= 1 and found["action"] < 1e-6
     # Another version of FFmpeg may round a colour otherwise.
     assert found["image"] <= 2
+
+
+ROBOMIMIC = """
+    import json, sys
+    import numpy as np
+    import robomimic.utils.file_utils as files
+    import robomimic.utils.obs_utils as observations
+    from robomimic.utils.dataset import SequenceDataset
+    keys = ["robot0_gripper_qpos", "wrist_image"]
+    specs = {"low_dim": keys[:1], "rgb": keys[1:]}
+    observations.initialize_obs_utils_with_obs_specs([{"obs": specs}])
+    env = files.get_env_metadata_from_dataset(sys.argv[1])
+    datasets = [
+        SequenceDataset(
+            hdf5_path=sys.argv[1], obs_keys=keys, dataset_keys=["actions", "rewards", "dones"],
+            frame_stack=2, seq_length=10, load_next_obs=False, hdf5_cache_mode="low_dim",
+            filter_by_attribute=name,
+        )
+        for name in (None, "generated")
+    ]
+    every = (datasets[0][i] for i in range(len(datasets[0])))
+    most = max(float(np.abs(item["actions"]).max()) for item in every)
+    shape = datasets[0][3]["obs"]["wrist_image"].shape
+    print(json.dumps({"env": env["env_name"], "n": [len(d) for d in datasets], "most": most,
+                      "shape": shape}))
+"""
+
+
+def test_robomimic_reads_its_file_for_training(dataset_of, tmp_path):
+    python = os.environ.get(ROBOMIMIC_PYTHON)
+    if python is None:
+        pytest.skip(f"{ROBOMIMIC_PYTHON} names no Python that has robomimic")
+    folder = dataset_of("peg_in_hole")
+    main(["export", f"{folder}/dataset", "--format", "robomimic", "--out", f"{tmp_path}/a.hdf5"])
+    lengths = [len(t) for t in trajectories_of(load_dataset(folder / "dataset"))]
+    found = in_python(python, ROBOMIMIC, tmp_path / "a.hdf5")
+    assert found["env"] == "sart/PegInHole-v0" and found["most"] <= 1
+    assert found["n"] == [sum(lengths), sum(lengths[1:])]
+    assert found["shape"] == [11, 64, 64, 3]
 
 
 ZARR = """
