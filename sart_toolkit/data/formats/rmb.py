@@ -261,6 +261,10 @@ class _Recording:
         text = file.attrs.get("sart")
         # What only the toolkit's own files say.
         self._ours: dict[str, Any] = {} if text is None else json.loads(text)
+        for what in ("task", "robot", "gripper_range") if self._ours else ():
+            if getattr(given, what) is not None:
+                flag = what.replace("_", "-")
+                raise InvalidInput(f"says itself what --{flag} would; leave that out")
         self._cameras = [str(name) for name in np.ravel(file.attrs.get("camera_names", []))]
 
     def demonstration(self) -> Demonstration:
@@ -288,7 +292,7 @@ class _Recording:
             versions=library_versions(),
             rates=Rates(**ours["rates"]) if ours else self._rates(time),
             judged_by="task" if ours else "nobody",
-            references={**ours.get("references", {}), **self._given.references},
+            references=ours.get("references", self._given.references),
         )
 
     def _said(self, what: str) -> str:

@@ -161,6 +161,16 @@ def test_of_others_what_the_file_lacks_is_given(name, copy_of, trajectories):
         format.read(recording, Given(**{**given, "gripper_range": (3.0, 3.0)}))
 
 
+@pytest.mark.parametrize(
+    "said", [{"task": "a"}, {"robot": "b"}, {"gripper_range": (0.0, 255.0)}], ids=str
+)
+def test_what_the_file_says_itself_is_not_said_again(said, exported):
+    recording = Rmb().recordings(exported("rmb"))[0]
+    flag = next(iter(said)).replace("_", "-")
+    with pytest.raises(InvalidInput, match=f"says itself what --{flag} would; leave that out"):
+        Rmb().read(recording, Given(**said))
+
+
 def test_without_depth_it_is_read_as_if_nothing_was_hit(copy_of, caplog):
     recording = copy_of("rmb")
     (recording / "wrist_depth_image.rmb.mp4").unlink()
