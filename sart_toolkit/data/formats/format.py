@@ -351,11 +351,16 @@ def poses_of_rows(rows: Array) -> Array:
 
 
 def quaternions(Ts: Array, real: Literal["first", "last"]) -> Array:
-    """The rotations of poses `(n, 4, 4)` as unit quaternions `(n, 4)`, without jumps of sign."""
+    """The rotations of poses `(n, 4, 4)` as unit quaternions `(n, 4)`, without jumps of sign.
+
+    The sign of all is so that the first part of the first that is far from 0 is positive: which one
+    is greatest, or whether the real part is above 0, may be a matter of rounding.
+    """
     found = Rotation.from_matrix(Ts[:, :3, :3]).as_quat(scalar_first=real == "first")
     flips = np.sum(found[1:] * found[:-1], axis=1) < 0
     found[1:][np.cumsum(flips) % 2 == 1] *= -1
-    return np.asarray(found)
+    first = found[0][np.abs(found[0]) > 0.1][0]
+    return np.asarray(found * np.sign(first))
 
 
 def all_problems(lines: Iterator[str]) -> list[str]:

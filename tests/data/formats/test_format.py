@@ -235,4 +235,11 @@ def test_quaternions_don_t_jump():
         found = quaternions(Ts, real=real)
         assert np.abs(np.diff(found, axis=0)).max() < 0.2
         assert abs(found[0, 0 if real == "first" else 3]) == pytest.approx(1)
+    # Half a turn about an axis between x and y, as it is and rounded another way.
+    half = exp_rotation(np.pi / np.sqrt(2) * np.array([1.0, -1.0, 0.0]))
+    for R in (half, half @ exp_rotation(np.array([1e-9, 1e-9, -1e-9]))):
+        T = np.eye(4)
+        T[:3, :3] = R
+        expected = [0, np.sqrt(0.5), -np.sqrt(0.5), 0]
+        np.testing.assert_allclose(quaternions(T[None], real="first")[0], expected, atol=1e-8)
     assert pose_rows(Ts).shape == (60, 9)
