@@ -149,9 +149,7 @@ def replacing_directory(path: Path, mark: str, overwrite: bool = False) -> Itera
         check_replaceable(path, mark, overwrite)
         with _cannot_write(path):
             real = linked(path)
-            for left in real.parent.glob(f".{glob.escape(real.name)}.*"):
-                if left.is_dir() and _TEMPORARY.fullmatch(left.name):
-                    shutil.rmtree(left)
+            remove_left(real.parent, f".{real.name}.", "")
             temporary = Path(tempfile.mkdtemp(dir=real.parent, prefix=f".{real.name}."))
             try:
                 yield temporary
@@ -172,6 +170,23 @@ def replacing_directory(path: Path, mark: str, overwrite: bool = False) -> Itera
                     os.replace(temporary, real)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove_left(directory: Path, prefix: str, suffix: str) -> None:
+    """Remove what a process that was killed has left of writing something large.
+
+    Only who holds the lock of that output can know that nobody is writing it any more.
+
+    Args:
+        directory: where it is.
+        prefix, suffix: what stands before and after the characters drawn at random.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    for left in directory.glob(f"{glob.escape(prefix)}*{glob.escape(suffix)}"):
+        if re.fullmatch(r"[a-z0-9_]{8}", left.name[len(prefix) : len(left.name) - len(suffix)]):
+            remove(left)
 
 
 def link_file(source: Path, target: Path) -> None:

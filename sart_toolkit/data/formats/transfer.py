@@ -7,7 +7,14 @@ from pathlib import Path
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.formats.format import About, Format, Progress, counted, trajectories_of
 from sart_toolkit.data.records import Demonstration
-from sart_toolkit.data.storage import OutputLock, check_writable, replacing, replacing_directory
+from sart_toolkit.data.storage import (
+    OutputLock,
+    check_writable,
+    linked,
+    remove_left,
+    replacing,
+    replacing_directory,
+)
 from sart_toolkit.errors import InvalidInput
 
 
@@ -50,5 +57,6 @@ def export_dataset(
     else:
         with OutputLock(out):
             check_writable(out, overwrite)
+            remove_left(linked(out).parent, f".{out.stem}.", out.suffix)
             with replacing(out) as file:
                 format.write(file, trajectories, about)

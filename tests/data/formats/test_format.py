@@ -127,6 +127,12 @@ def test_what_a_killed_export_left_is_removed_by_the_next(peg_dataset, tmp_path)
     (tmp_path / ".peg_other.abcd1234").mkdir()
     written(peg_dataset, "lerobot", tmp_path / "peg")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".peg_other.abcd1234", "peg"]
+    (tmp_path / ".peg.abcd1234.hdf5").write_text("half")
+    (tmp_path / ".peg.mine.hdf5").write_text("mine")
+    written(peg_dataset, "robomimic", tmp_path / "peg.hdf5")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".peg.mine.hdf5", ".peg_other.abcd1234", "peg", "peg.hdf5",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FORMATS)
