@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -71,6 +72,30 @@ def best_codec(codecs: Sequence[Codec]) -> Codec:
     )
 
 
+@contextlib.contextmanager
+def _ordinary_scheduling() -> Iterator[None]:
+    """Within it no thread of this process becomes a real-time one.
+
+    SVT-AV1 makes its own threads and the one that calls it so, where it may, as root: whatever else
+    is at work on the machine, and what this process starts later, would suffer.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        yield
+        return
+    before, how, parameters = _threads(), os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        for thread in (_threads() - before) | {threading.get_native_id()}:
+            with contextlib.suppress(ProcessLookupError):
+                if os.sched_getscheduler(thread) != how:
+                    os.sched_setscheduler(thread, how, parameters)
+
+
+def _threads() -> set[int]:
+    return {int(name) for name in os.listdir("/proc/self/task")}
+
+
 class VideoWriter:
     """Writes frames of one size to an MP4 file, the first at time 0.
 
@@ -104,7 +129,8 @@ class VideoWriter:
     @contextlib.contextmanager
     def _encoding(self) -> Iterator[None]:
         try:
-            yield
+            with _ordinary_scheduling():
+                yield
         except self._av.FFmpegError as error:
             raise CannotWrite(
                 f"{self.path.name}: {error.strerror}; nothing was replaced, make room or choose "
