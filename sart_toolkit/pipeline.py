@@ -318,6 +318,7 @@ def record(
 
     found = get_task(task)
     spec, scene = get_robot(robot or found.robot), found.scene
+    found.check_operable(yaw_deg)
     rng = np.random.default_rng(seed)
     at = found.sample_placement(rng, yaw_deg) if placement == "random" else Placement()
     references = {

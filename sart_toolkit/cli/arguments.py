@@ -636,6 +636,8 @@ class Evaluate:
 
     Example: sart evaluate skill --out varied.json --vary-appearance --yaw-deg 15
 
+    Example: sart evaluate skill --out camera.json --appearance camera=0.005,camera_deg=2
+
     Interrupted, it resumes when the same command is typed again.
     """
 
@@ -647,7 +649,25 @@ class Evaluate:
     episodes: _EPISODES = 50
     eval_seed: _EVAL_SEED = 1000
     yaw_deg: _YAW = 0.0
+    placement_range: Annotated[
+        float | None,
+        _optional(
+            "METRES", "Half width of the square of placements [m]; the task's own if left out."
+        ),
+    ] = None
     vary_appearance: _APPEARANCE = False
+    appearance: Annotated[
+        str | None,
+        _optional(
+            "NAME=NUMBER,...",
+            "Vary only these: colour, light, ambient (shares), light_deg, camera [m], camera_deg, "
+            "camera_offset [m] (moved just so far), distractors (how many); nothing if left out.",
+        ),
+    ] = None
+    latency: Annotated[float, arg(help="So late the policy sees what it acts on [s].")] = 0.0
+    final_images: Annotated[
+        bool, arg(help="Keep what the cameras saw at the end of each failure, beside OUT.")
+    ] = False
     videos: Annotated[int, arg(help="Videos of the first successes, and as many of failures.")] = 2
     workers: _WORKERS = 2
     executor: _EXECUTOR = "processes"

@@ -157,6 +157,14 @@ class SkillFile(msgspec.Struct):
     cameras: Values | UnsetType = UNSET
 
 
+class Reached(msgspec.Struct, forbid_unknown_fields=True):
+    """The furthest waypoint that a rollout reached, of how many, and when."""
+
+    waypoint: Count
+    of: Count
+    seconds: Seconds
+
+
 class EvaluatedEpisode(msgspec.Struct):
     """A rollout of `evaluation.json`."""
 
@@ -167,6 +175,8 @@ class EvaluatedEpisode(msgspec.Struct):
     success_any: bool = False
     steps: Count | str = ""
     reason: str | None = None
+    progress: Reached | None = None
+    final_image: PathInside | None = None
 
 
 class Video(msgspec.Struct):

@@ -31,6 +31,7 @@ from sart_toolkit.evaluate.rollout import (
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.learn.skill import save_skill
 from sart_toolkit.learn.training import TrainConfig, train
+from sart_toolkit.scenes.appearance import AppearanceConfig
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
 
@@ -44,7 +45,8 @@ class Player:
         self.actions = [np.array(action) for action in actions]
         self.config = SimpleNamespace(robot="ur5e_2f85", training=SimpleNamespace(policy="player"))
         self.cameras = ("wrist",)
-        self.demonstration = SimpleNamespace(rates=DEFAULT_RATES)
+        steps = SimpleNamespace(measured_Ts_world_tool=np.eye(4)[None], measured_gripper=np.ones(1))
+        self.demonstration = SimpleNamespace(rates=DEFAULT_RATES, task_parameters={}, steps=steps)
         self.seen = []
 
     def reset(self):
@@ -221,7 +223,7 @@ def test_objects_are_turned_and_the_appearance_varies_where_asked_for(evaluate, 
     for name, options in (
         ("plain", {}),
         ("turned", {"yaw_deg": 15.0}),
-        ("appearance", {"vary_appearance": True}),
+        ("appearance", {"appearance": AppearanceConfig()}),
     ):
         player = Watching()
         player.rollouts = []
@@ -252,8 +254,7 @@ def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
     assert result["ci95"] == result["ci95_any"] == list(wilson_interval(0, 3))
     assert result["seeds"] == {"eval_seed": 11, "episodes": [[11, 0], [11, 1], [11, 2]]}
     assert result["seconds"] > 0 and result["videos"] == [] and "python" in result["versions"]
-    asked = {"episodes": 3, "eval_seed": 11, "videos": 0, "yaw_deg": 0.0, "vary_appearance": False}
-    assert result["config"] == asked
+    assert result["config"] == dataclasses.asdict(config)
     for i, row in enumerate(result["episodes"]):
         assert row["episode"] == i and row["seed"] == [11, i] and row["steps"] == 6
         assert row["placement"] == {"block": episode_placement(short_task, 11, i).to_json()}
