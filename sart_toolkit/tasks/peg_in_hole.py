@@ -124,12 +124,18 @@ class PegInHole(Task):
         T = self._start()
         T[:3, :3] = hole[:3, :3] @ T[:3, :3]
         steps = []
-        # Into a narrow hole a person goes only when the peg is well over it, and upright.
-        over, upright_deg = min(0.004, 0.5 * self.clearance), min(2.0, 500 * self.clearance)
-        for tip_height, speed, tolerance in ((0.012, 0.07, over), (-_INSERTION, 0.03, 0.003)):
+        # Height of the tip, speed, tolerance, and that of the angle, how unsteady the hand is.
+        stages = [(0.012, 0.07, 0.004, 2.0, 1.0), (-_INSERTION, 0.03, 0.003, 2.0, 1.0)]
+        if self.clearance < 0.004:
+            # A person stops over the rim until the peg is well over the hole, and takes care.
+            exact = 0.25 * self.clearance
+            stages[1:] = [(0.003, 0.02, exact, 0.3, 0.1), (-_INSERTION, 0.03, 0.003, 2.0, 0.1)]
+        for tip_height, speed, tolerance, tolerance_deg, tremor in stages:
             T_step = T.copy()
             T_step[:3, 3] = hole[:3, 3] + [0, 0, HOLE_DEPTH + tip_height + _PEG_TIP_BELOW_TOOL]
-            steps.append(PlanStep(T_step, _GRIPPER, speed, tolerance, upright_deg))
+            steps.append(
+                PlanStep(T_step, _GRIPPER, speed, tolerance, tolerance_deg, tremor=tremor)
+            )
         return steps
 
 

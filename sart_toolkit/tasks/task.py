@@ -64,7 +64,8 @@ class PlanStep:
     It ends when the tool has been within `tolerance` [m] and `tolerance_deg` for `pause` [s]
     (while fingers close, for instance). `speed` [m/s] is what a person would choose there;
     `gripper` is the command held throughout. With `through` the operator neither slows down before
-    the end nor hesitates after it: a point on a curve.
+    the end nor hesitates after it: a point on a curve. `tremor`: how unsteady the hand is, as a
+    fraction of its usual tremor; a person who has to be exact takes care.
     """
 
     T_world_tool: Array
@@ -74,6 +75,7 @@ class PlanStep:
     tolerance_deg: float = 2.0
     pause: float = 0.0
     through: bool = False
+    tremor: float = 1.0
 
 
 class Task(abc.ABC):
