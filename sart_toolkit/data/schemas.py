@@ -220,6 +220,30 @@ class RunFile(msgspec.Struct):
     machine: Values = {}
 
 
+class JobFile(msgspec.Struct, forbid_unknown_fields=True):
+    """`job.json` of a benchmark's stage that is done."""
+
+    stage: Literal["record", "suggest", "augment", "train", "evaluate"]
+    options: Values
+    size: Annotated[int, Meta(ge=1, le=2**53)]
+    seconds: Seconds
+    bytes: Count
+    figures: Values
+
+
+class CellFile(msgspec.Struct):
+    """A cell of a benchmark; besides, whatever was kept with it."""
+
+    name: Name
+    cell: Values
+    keys: dict[str, str]
+    seconds: dict[str, Seconds]
+    figures: dict[str, Values]
+    # None where only effort was asked for.
+    evaluation: EvaluationFile | None
+    command: str = ""
+
+
 class StateHead(msgspec.Struct):
     """What a saved state says of itself; besides, the backend's own values."""
 

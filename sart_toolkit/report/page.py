@@ -174,24 +174,24 @@ def _field(value: Any, file: str, *keys: str) -> Any:
 # --- images and numbers -----------------------------------------------------------------------
 
 
-def _data_uri(kind: str, content: bytes) -> str:
+def data_uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def _image(png: bytes, alt: str, dark: bytes | None = None) -> Shown:
+def image(png: bytes, alt: str, dark: bytes | None = None) -> Shown:
     # A PNG's width and height are the first two numbers of its first chunk.
     width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
     return {
-        "src": _data_uri("image/png", png),
-        "dark": None if dark is None else _data_uri("image/png", dark),
+        "src": data_uri("image/png", png),
+        "dark": None if dark is None else data_uri("image/png", dark),
         "alt": alt,
         "width": width,
         "height": height,
     }
 
 
-def _drawn(draw: Callable[[Theme], bytes], alt: str) -> Shown:
-    return _image(draw("light"), alt, draw("dark"))
+def drawn(draw: Callable[[Theme], bytes], alt: str) -> Shown:
+    return image(draw("light"), alt, draw("dark"))
 
 
 # No line may end between a number and its unit.
@@ -346,7 +346,7 @@ def _demonstration(run: _Run) -> Shown | str:
     n = min(_FILM_IMAGES, len(d))
     end = duration(float(d.timestamps[-1] - d.timestamps[0]))
     alt = f"{n} images of the {camera} camera, evenly from the start to the end after {end}"
-    return {"camera": camera, "film": _image(film_strip(d, camera, n), alt)}
+    return {"camera": camera, "film": image(film_strip(d, camera, n), alt)}
 
 
 def _spheres(run: _Run) -> Shown | str:
@@ -357,8 +357,8 @@ def _spheres(run: _Run) -> Shown | str:
     annotation.check_matches(demonstration)
     if run.augmentation is not None:
         rows = _field(run.augmentation, "dataset.json", "by_sphere")
-        drawn = [row["waypoint"] for row in rows if row["source"] == 0]
-        if drawn != [sphere.waypoint for sphere in annotation.spheres]:
+        waypoints = [row["waypoint"] for row in rows if row["source"] == 0]
+        if waypoints != [sphere.waypoint for sphere in annotation.spheres]:
             # By a strategy that has spheres of its own.
             paths = ()
 
@@ -384,7 +384,7 @@ def _spheres(run: _Run) -> Shown | str:
         f"Two 3D views of the demonstrated tool path with {_plural(len(shown), 'precision sphere')}"
         + (f" and {_plural(len(paths), 'augmented path')} leading back to it" if paths else "")
     )
-    return {"drawing": _drawn(draw, alt), "spheres": shown}
+    return {"drawing": drawn(draw, alt), "spheres": shown}
 
 
 def _augmentation(run: _Run) -> Shown | str:
@@ -450,7 +450,7 @@ def _training(run: _Run) -> Shown | str:
         "epochs": len(curve),
         "seconds": sum(float(_field(row, file, "seconds")) for row in curve),
         "images_per_second": run.training.get("images_per_second"),
-        "curve": _drawn(draw, alt),
+        "curve": drawn(draw, alt),
     }
 
 
@@ -489,7 +489,7 @@ def _placements(run: _Run, episodes: Sequence[Mapping[str, Any]]) -> Shown | Non
     good = outcomes.count("success")
     bad = len(places) - good
     alt = f"Top view of {len(places)} object placements: {good} successes, {bad} failures"
-    return _drawn(draw, alt)
+    return drawn(draw, alt)
 
 
 def _videos(run: _Run) -> Shown | str:
@@ -518,7 +518,7 @@ def _videos(run: _Run) -> Shown | str:
         room -= len(content)
         videos.append(
             {
-                "src": _data_uri("video/mp4", content),
+                "src": data_uri("video/mp4", content),
                 "episode": row.get("episode", "?"),
                 "outcome": str(row.get("outcome", "")),
                 "evaluated_outcome": row.get("evaluated_outcome"),
@@ -616,7 +616,7 @@ _SECTIONS: tuple[tuple[str, str, Callable[[_Run], Shown | str]], ...] = (
 
 
 @functools.cache
-def _templates() -> jinja2.Environment:
+def templates() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sart_toolkit.report"),
         autoescape=True,
@@ -647,7 +647,7 @@ def _page(run: _Run) -> str:
                 {"title": title, "template": template, "shown": shown, "absent": absent}
             )
         return (
-            _templates()
+            templates()
             .get_template("page.html")
             .render(
                 task=task,

@@ -133,9 +133,7 @@ class PegInHole(Task):
         for tip_height, speed, tolerance, tolerance_deg, tremor in stages:
             T_step = T.copy()
             T_step[:3, 3] = hole[:3, 3] + [0, 0, HOLE_DEPTH + tip_height + _PEG_TIP_BELOW_TOOL]
-            steps.append(
-                PlanStep(T_step, _GRIPPER, speed, tolerance, tolerance_deg, tremor=tremor)
-            )
+            steps.append(PlanStep(T_step, _GRIPPER, speed, tolerance, tolerance_deg, tremor=tremor))
         return steps
 
 

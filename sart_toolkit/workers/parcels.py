@@ -171,7 +171,7 @@ class _Unpacker(pickle.Unpickler):
 # --- a person's own modules ---------------------------------------------------------------------
 
 
-def _own_modules() -> list[Path]:
+def own_modules() -> list[Path]:
     """The files of the modules that were imported from neither Python, packages nor the toolkit."""
     others = [sys.prefix, sys.base_prefix, *site.getsitepackages(), site.getusersitepackages()]
     folders = [_PACKAGE, *map(Path, others)]
@@ -197,7 +197,7 @@ class Home:
 
     def files_needed(self) -> list[Path]:
         """The person's own modules."""
-        return _own_modules()
+        return own_modules()
 
     def settle(self) -> None:
         """Let this process, which has copies of the files, find them as that machine does."""
