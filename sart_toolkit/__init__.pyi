@@ -191,6 +191,7 @@ from .errors import (
 from .errors import (
     Unreachable as Unreachable,
 )
+from .evaluate.compare import compare_rollouts as compare_rollouts
 from .evaluate.rollout import (
     EvaluateConfig as EvaluateConfig,
 )
@@ -213,6 +214,7 @@ from .learn.skill import save_skill as save_skill
 from .learn.training import TrainConfig as TrainConfig
 from .learn.training import train as train
 from .pipeline import run as run
+from .pipeline import run_benchmark as run_benchmark
 from .pipeline import run_skill as run_skill
 from .pipeline import train_seeds as train_seeds
 from .poses import inverse as inverse

@@ -1182,6 +1182,7 @@ def run(
         ("evaluate", evaluation, lambda: evaluate(
             skill, evaluation, task=task, robot=robot, backend=backend, workers=workers,
             device=device, progress=progress, episodes=episodes, eval_seed=eval_seed, videos=2,
+            final_images=True,
         )),
     ]  # fmt: skip
     for name, result, carry_out in steps:
@@ -1238,7 +1239,7 @@ def _resumed(out: Path, wanted: Mapping[str, Any], overwrite: bool) -> dict[str,
     return {"config": wanted, "stages": {}}
 
 
-def benchmark(
+def run_benchmark(
     plan: str | Path | Plan,
     out: Path | str,
     *,
@@ -1246,7 +1247,7 @@ def benchmark(
     only: str | None = None,
     store: Path | None = None,
     workers: int | Workers = 1,
-    command: str = "sart_toolkit.benchmark",
+    command: str = "sart_toolkit.run_benchmark",
     dry_run: bool = False,
     progress: Progress = _silent,
 ) -> dict[str, Any]:

@@ -70,8 +70,9 @@ def jobs_of(cell: PlanCell) -> dict[str, Job]:
     """
     strategy = get_strategy(cell.strategy)
     n = strategy.n if cell.n is None else cell.n
-    references = (cell.task, cell.backend, cell.evaluate_on or cell.backend, cell.strategy)
-    references += (cell.policy or strategy.policy,)
+    policy = cell.policy or strategy.policy
+    where = cell.evaluate_on or cell.backend
+    references = (cell.task, cell.backend, where, cell.strategy, policy)
     found: dict[str, Job] = {}
 
     def add(stage: str, size: int, options: Mapping[str, Any], **inputs: str) -> None:
@@ -99,16 +100,20 @@ def jobs_of(cell: PlanCell) -> dict[str, Job]:
     )
     if strategy.annotated:
         add("suggest", count, without_label(cell.suggestion), demo="record")
-    generation = {"n": n, "strategy": cell.strategy, "seed": cell.demonstration_seed}
+    generation: dict[str, Any] = {
+        "n": n,
+        "strategy": cell.strategy,
+        "seed": cell.demonstration_seed,
+    }
     generation |= without_label(cell.generation)
     add("augment", n, generation, demo="record", annotation="suggest")
     if cell.until == "augment":
         return found
     # What is learned depends on the number of threads in the last bits: one, everywhere.
-    training = {"policy": cell.policy or strategy.policy, "seed": cell.training_seed}
+    training: dict[str, Any] = {"policy": policy, "seed": cell.training_seed}
     training |= {"device": cell.device, "threads": 1, **without_label(cell.training)}
     add("train", n, training, dataset="augment")
-    evaluation = {"backend": cell.evaluate_on or cell.backend, "device": cell.device}
+    evaluation: dict[str, Any] = {"backend": where, "device": cell.device}
     evaluation |= {"episodes": cell.episodes, "eval_seed": cell.eval_seed}
     add("evaluate", cell.episodes, evaluation | without_label(cell.variation), skill="train")
     assert list(found) == [stage for stage in STAGES if stage in found]

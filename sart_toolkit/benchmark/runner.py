@@ -169,9 +169,10 @@ def run_plan(
 ) -> dict[str, Any]:
     """The result of a plan, as in `out`/benchmark.json; a file of each cell and a page beside it.
 
-    Cells are in `out`/cells, the page is `out`/benchmark.html. Stage by stage every job that isn't done is carried out once, however many cells share it, and
-    kept under its key: called again, after an interruption or with another plan and the same
-    store, only what is missing is done. A job that fails leaves out its cells and no others.
+    Cells are in `out`/cells, the page is `out`/benchmark.html. Stage by stage every job that isn't
+    done is carried out once, however many cells share it, and kept under its key: called again,
+    after an interruption or with another plan and the same store, only what is missing is done. A
+    job that fails leaves out its cells and no others.
 
     Args:
         plan: the plan.
@@ -180,7 +181,7 @@ def run_plan(
         workers: how many processes, or `Workers` elsewhere; no disk need be shared.
         store: directory of the stages' results, `out`/stages if left out.
         about: what is to be kept with the result: command and machine, say.
-        progress: called with a stage, the jobs done of how many, and a few words.
+        progress: called with "benchmark", the jobs done of how many, and the stage.
 
     Raises:
         UnknownName: a cell's reference leads to nothing.
@@ -253,7 +254,7 @@ def _carry_out_stage(
     gpu = any(job.options.get("device", "cpu") != "cpu" for job in missing)
     n_failed = 0
     if progress is not None:
-        progress(stage, 0, len(missing), "")
+        progress("benchmark", 0, len(missing), stage)
     with worker_map(make_worker, workers, gpu) as run:
         outcomes = run([kept.errand(job) for job in missing])
         for done, (job, outcome) in enumerate(zip(missing, outcomes, strict=True), 1):
@@ -262,7 +263,8 @@ def _carry_out_stage(
                 n_failed += 1
                 _log.warning("%s", outcome.failure)
             if progress is not None:
-                progress(stage, done, len(missing), f"{n_failed} failed" if n_failed else "")
+                text = f"{stage}, {n_failed} failed" if n_failed else stage
+                progress("benchmark", done, len(missing), text)
 
 
 def _cell_result(

@@ -9,7 +9,6 @@ import numpy as np
 
 from sart_toolkit.benchmark.plans import FIELDS, Plan, PlanCell
 from sart_toolkit.evaluate.compare import compare_rollouts, rate_of
-from sart_toolkit.evaluate.failures import group_failures
 from sart_toolkit.evaluate.statistics import holm
 
 _SEEDS = ("demonstration_seed", "training_seed")
@@ -19,8 +18,8 @@ def summarise(plan: Plan, cells: Sequence[Mapping[str, Any]]) -> list[dict[str, 
     """A table for each combination of what differs besides rows, columns and seeds.
 
     Each has `given` (that combination), the names of its `rows` and `columns`, and `entries`; an
-    entry has its cells' names, how often they succeeded, kinds of failure, effort, and how it
-    compares with the reference column's entry of its row. p-values are Holm's over a table.
+    entry has its cells' names, how often they succeeded, effort, and how it compares with the
+    reference column's entry of its row. p-values are Holm's over a table.
 
     Args:
         plan: what was asked for.
@@ -91,17 +90,7 @@ def _entry(group: Sequence[PlanCell], by_name: Mapping[str, Mapping[str, Any]]) 
     units: dict[int, list[Mapping[str, Any]]] = {}
     for cell, result in zip(group, results, strict=True):
         units.setdefault(getattr(cell, unit), []).extend(_rollouts(result))
-    failed = [
-        {**row, "episode": [result["name"], row["episode"]]}
-        for result in results
-        for row in _rollouts(result)
-    ]
-    kinds = [
-        {"reason": kind.reason, "rollouts": list(kind.episodes), "waypoint": kind.waypoint,
-         "seconds": kind.seconds}
-        for kind in group_failures(failed)
-    ]  # fmt: skip
-    return entry | {"unit": unit, "rate": rate_of(list(units.values())), "failures": kinds}
+    return entry | {"unit": unit, "rate": rate_of(list(units.values()))}
 
 
 def _rollouts(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:

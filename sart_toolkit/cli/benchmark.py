@@ -65,7 +65,7 @@ def plan_verb(args: Benchmark) -> Result:
         SartError: a cell failed; the others are done.
     """
     with ProgressDisplay() as progress:
-        result = pipeline.benchmark(
+        result = pipeline.run_benchmark(
             args.plan,
             args.out,
             changes=_changes(args.set),

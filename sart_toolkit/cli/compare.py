@@ -56,10 +56,7 @@ def _rollouts(path: Path) -> list[dict[str, Any]]:
     """
     if path.is_dir():
         beside = (path / "evaluation.json", path.parent / "evaluation.json")
-        if (path / "model.safetensors").exists():
-            places = beside
-        else:
-            places = beside[:1]
+        places = beside if (path / "model.safetensors").exists() else beside[:1]
         found = next((place for place in places if place.exists()), None)
         if found is None:
             raise MissingFile(

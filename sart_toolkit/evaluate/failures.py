@@ -16,9 +16,9 @@ _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 class FailureKind:
     """Failures whose reasons differ in numbers alone.
 
-    `reason` has the median of each number, `episodes` are those of the rows that failed so. `waypoint` and
-    `seconds` are the medians of the furthest waypoint of the demonstration that these rollouts
-    reached and of when they did; None where none of them says.
+    `reason` has the median of each number, `episodes` are those of the rows that failed so.
+    `waypoint` and `seconds` are the medians of the furthest waypoint of the demonstration that
+    these rollouts reached and of when they did; None where none of them says.
     """
 
     reason: str

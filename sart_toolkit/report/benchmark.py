@@ -7,15 +7,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image as PillowImage
-
 from sart_toolkit.data.storage import write_text
-from sart_toolkit.report.figures import Rate, Theme, montage, rates_image
-from sart_toolkit.report.page import Shown, drawn, duration, image, percent, templates
+from sart_toolkit.evaluate.failures import group_failures
+from sart_toolkit.report.figures import Rate, Theme, rates_image
+from sart_toolkit.report.page import (
+    Shown,
+    drawn,
+    duration,
+    last_images,
+    percent,
+    reached_words,
+    templates,
+)
 
-# Of each kind of failure so many final images are shown.
-_SHOWN = 6
 Result = Mapping[str, Any]
 
 
@@ -94,7 +98,8 @@ def _table(
                 entry["row"],
                 entry["column"],
                 entry["rate"]["success_rate"],
-                *entry["rate"]["ci95"],
+                entry["rate"]["ci95"][0],
+                entry["rate"]["ci95"][1],
                 tuple(entry["rate"]["units"]),
             )
             for entry in rated
@@ -111,34 +116,23 @@ def _kinds(
     entry: Result, by_name: Mapping[str, Result], evaluations: Mapping[str, Path]
 ) -> Iterable[Shown]:
     """The kinds of failure of an entry, each with the last images of some of its rollouts."""
-    for kind in entry["failures"]:
-        images, captions = [], []
-        for name, episode in kind["rollouts"]:
-            rows = by_name[name]["evaluation"]["episodes"]
-            row = next(row for row in rows if row["episode"] == episode)
-            path = evaluations[name] / str(row.get("final_image"))
-            if len(images) < _SHOWN and path.is_file():
-                with PillowImage.open(path) as opened:
-                    images.append(np.asarray(opened.convert("RGB")))
-                captions.append(f"{episode}: {_moment(row)}{row['reason']}")
-        drawing = None
-        if images:
-            alt = f"What overview and wrist camera saw at the end of {len(images)} failed rollouts"
-            drawing = image(montage(images, captions), alt)
+    rows = [
+        (evaluations[name], {**row, "episode": (name, row["episode"])})
+        for name in entry["cells"]
+        for row in by_name[name]["evaluation"]["episodes"]
+    ]
+    for kind in group_failures([row for _, row in rows]):
+        chosen = [
+            (path, {**row, "episode": row["episode"][1]})
+            for path, row in rows
+            if row["episode"] in kind.episodes
+        ]
         yield {
-            "row": entry["row"],
-            "column": entry["column"],
-            "reason": kind["reason"],
-            "count": len(kind["rollouts"]),
-            "waypoint": kind["waypoint"],
-            "seconds": kind["seconds"],
-            "drawing": drawing,
+            "reason": f"{entry['row']}, {entry['column']}: {kind.reason}",
+            "count": len(kind.episodes),
+            "reached": reached_words(kind),
+            "drawing": last_images(chosen),
         }
-
-
-def _moment(row: Result) -> str:
-    progress = row.get("progress")
-    return f"waypoint {progress['waypoint']} at {progress['seconds']:g} s; " if progress else ""
 
 
 def _cell(cell: Result, command: str) -> Shown:

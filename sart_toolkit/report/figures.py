@@ -438,6 +438,7 @@ def rates_image(rates: Sequence[Rate], across: str, theme: Theme = "light") -> b
             axes.xaxis.set_minor_formatter(NullFormatter())
         else:
             axes.set_xticks(range(len(rows)), rows, rotation=20 if len(rows) > 3 else 0)
+            axes.set_xlim(-0.6, len(rows) - 0.4)
         axes.set_xlabel(across if numbers else "")
         axes.set_ylabel("success [%]")
         axes.set_ylim(-4, 104)

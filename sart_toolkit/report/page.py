@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jinja2
+import numpy as np
+from PIL import Image as PillowImage
 
 from sart_toolkit.data.dataset import load_dataset
-from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.data.records import Annotation, Demonstration, Image
 from sart_toolkit.data.schemas import EvaluationFile, RunFile, TrainingFile
 from sart_toolkit.data.storage import (
     load_annotation,
@@ -26,10 +28,12 @@ from sart_toolkit.data.storage import (
     write_text,
 )
 from sart_toolkit.errors import BrokenFile, MissingFile, SartError
+from sart_toolkit.evaluate.failures import FailureKind, group_failures
 from sart_toolkit.report.figures import (
     SegmentPath,
     Theme,
     film_strip,
+    montage,
     placement_image,
     scene_image,
     segment_paths,
@@ -39,6 +43,8 @@ from sart_toolkit.report.figures import (
 
 MAX_VIDEO_BYTES = 48 * 2**20
 _FILM_IMAGES = 8
+# Of each kind of failure so many final images are shown.
+_LAST_IMAGES = 6
 
 Shown = dict[str, Any]
 
@@ -175,10 +181,12 @@ def _field(value: Any, file: str, *keys: str) -> Any:
 
 
 def data_uri(kind: str, content: bytes) -> str:
+    """Content as an address that a page carries inside."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def image(png: bytes, alt: str, dark: bytes | None = None) -> Shown:
+    """A PNG as the templates' macros show it, with another one for dark screens."""
     # A PNG's width and height are the first two numbers of its first chunk.
     width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
     return {
@@ -191,6 +199,7 @@ def image(png: bytes, alt: str, dark: bytes | None = None) -> Shown:
 
 
 def drawn(draw: Callable[[Theme], bytes], alt: str) -> Shown:
+    """What is drawn in either theme, as the templates' macros show it."""
     return image(draw("light"), alt, draw("dark"))
 
 
@@ -458,18 +467,58 @@ def _success(run: _Run) -> Shown | str:
     if run.evaluation is None:
         return "No evaluation.json in this run: the skill was not evaluated yet."
     episodes = _field(run.evaluation, "evaluation.json", "episodes")
-    reasons = collections.Counter(
-        str(e.get("reason") or "no reason given") for e in episodes if e.get("outcome") == "failure"
-    )
+    kinds = [
+        {
+            "reason": kind.reason,
+            "count": len(kind.episodes),
+            "reached": reached_words(kind),
+            "drawing": last_images(
+                [(run.directory, e) for e in episodes if e["episode"] in kind.episodes]
+            ),
+        }
+        for kind in group_failures(episodes)
+    ]
     at_any_time = None
     if "n_success_any" in run.evaluation:
         at_any_time = _success_rate(run.evaluation, "_any")
     return {
         "at_end": _success_rate(run.evaluation),
         "at_any_time": at_any_time,
-        "reasons": reasons.most_common(),
+        "kinds": kinds,
         "placements": _placements(run, episodes),
     }
+
+
+def reached_words(kind: FailureKind) -> str:
+    """How far along the demonstration failures of a kind came, and when."""
+    if kind.waypoint is None:
+        return "none came within 2 cm of the demonstrated path"
+    return f"waypoint {kind.waypoint:.0f}, after {kind.seconds:.1f}{_SPACE}s"
+
+
+def last_images(rollouts: Iterable[tuple[Path, Mapping[str, Any]]]) -> Shown | None:
+    """What cameras saw at the end of some rollouts, with how each ended; None where none is kept.
+
+    Args:
+        rollouts: directory and row of `evaluation.json`.
+    """
+    images: list[Image] = []
+    captions: list[str] = []
+    for directory, row in rollouts:
+        path = directory / str(row.get("final_image"))
+        if not path.is_file() or len(images) == _LAST_IMAGES:
+            continue
+        with PillowImage.open(path) as opened:
+            images.append(np.asarray(opened.convert("RGB")))
+        reached = row.get("progress")
+        moment = f"waypoint {reached['waypoint']} at {reached['seconds']:g} s; " if reached else ""
+        captions.append(f"{row['episode']}: {moment}{row.get('reason')}")
+    if not images:
+        return None
+    alt = (
+        f"What overview and wrist camera saw at the end of {_plural(len(images), 'failed rollout')}"
+    )
+    return image(montage(images, captions), alt)
 
 
 def _placements(run: _Run, episodes: Sequence[Mapping[str, Any]]) -> Shown | None:
@@ -617,6 +666,7 @@ _SECTIONS: tuple[tuple[str, str, Callable[[_Run], Shown | str]], ...] = (
 
 @functools.cache
 def templates() -> jinja2.Environment:
+    """The pages' templates, with their filters."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sart_toolkit.report"),
         autoescape=True,

@@ -153,7 +153,8 @@ def read_plan(plan: str | Path, changes: Mapping[str, Any] | None = None) -> Pla
 
     Args:
         plan: the name, or the file's path, which ends with `.toml`.
-        changes: values of fields, or lists of them, in place of those that every grid has.
+        changes: values of fields, or lists of them, in place of the grids' own; what only some
+            grids give is changed in those.
 
     Raises:
         UnknownName: no such plan, field or column.
@@ -178,7 +179,11 @@ def read_plan(plan: str | Path, changes: Mapping[str, Any] | None = None) -> Pla
     grids = value.pop("grid", [])
     if not isinstance(grids, list) or not all(isinstance(grid, dict) for grid in grids):
         raise InvalidInput(f"{path.name}: expected [[grid]] tables, got {grids!r}")
-    cells = [cell for grid in grids for cell in _cells(path.name, {**grid, **(changes or {})})]
+    given = {name for grid in grids for name in grid}
+    cells = []
+    for grid in grids:
+        new = {k: v for k, v in (changes or {}).items() if k in grid or k not in given}
+        cells += list(_cells(path.name, {**grid, **new}))
     # What is changed may make cells of two grids the same.
     unique = {msgspec.json.encode(cell.to_json()): cell for cell in cells}
     if any(not isinstance(text, str) for text in value.values()):
