@@ -841,7 +841,9 @@ class Benchmark:
     """Learn and evaluate every cell of a plan, a grid of skills, and show tables with intervals.
 
     Plans: table1, scaling, ablation, miles_radii, effort, transfer, placement, robustness,
-    precision; or a TOML file of your own, as docs/benchmarks.md has it.
+    precision; or a TOML file of your own, as docs/benchmarks.md has it. Measurements of the toolkit
+    itself have other flags, which sart benchmark operator --help says, and so on for replay,
+    segments, radii, cloud and skill.
 
     Example: sart benchmark table1 --out runs/table1 --dry-run
 

@@ -91,7 +91,7 @@ def find_verb(words: list[str]) -> tuple[str, list[str]]:
     if not second:
         return words[0], words[1:]
     if not words[1:]:
-        raise InvalidInput(f"{words[0]}: of what? add {', '.join([*PLANS, *second])}")
+        raise InvalidInput(f"{words[0]}: of what? add {', '.join([*second, *PLANS])}")
     if words[1] in second:
         return f"{words[0]} {words[1]}", words[2:]
     # A plan may be named after flags, too.
@@ -100,14 +100,13 @@ def find_verb(words: list[str]) -> tuple[str, list[str]]:
     return words[0], words[1:]
 
 
-def overview(of: str = "") -> str:
-    """What `sart --help` says: each verb with a line; of those that begin with `of`."""
-    chosen = {name: verb for name, verb in VERBS.items() if name.startswith(of)}
-    width = max(map(len, chosen))
-    lines = [f"  {name:<{width}}  {verb.summary}" for name, verb in chosen.items()]
+def overview() -> str:
+    """What `sart --help` says: each verb with a line."""
+    width = max(map(len, VERBS))
+    lines = [f"  {name:<{width}}  {verb.summary}" for name, verb in VERBS.items()]
     return "\n".join(
         [
-            f"usage: sart {of or 'VERB'} ...",
+            "usage: sart VERB ...",
             "",
             "Teach a robot a skill from one demonstration.",
             "",

@@ -194,4 +194,6 @@ def test_holm_keeps_the_order_and_stays_within_bonferroni(p_values: list[float])
 def test_few_rollouts_are_warned_of_with_what_they_leave_open() -> None:
     assert few_rollouts(20) is None
     warning = few_rollouts(10)
-    assert warning is not None and re.match(r"only 10 rollouts: .* between 24% and 76%; take", warning)
+    assert warning is not None and re.match(
+        r"only 10 rollouts: .* between 24% and 76%; take", warning
+    )
