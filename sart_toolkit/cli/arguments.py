@@ -842,8 +842,7 @@ class Benchmark:
 
     Plans: table1, scaling, ablation, miles_radii, effort, transfer, placement, robustness,
     precision; or a TOML file of your own, as docs/benchmarks.md has it. Measurements of the toolkit
-    itself have other flags, which sart benchmark operator --help says, and so on for replay,
-    segments, radii, cloud and skill.
+    itself, operator, replay, segments, radii, cloud and skill, have flags of their own.
 
     Example: sart benchmark table1 --out runs/table1 --dry-run
 
@@ -853,6 +852,8 @@ class Benchmark:
         --set task=peg_in_hole n=20,40 demonstration_seed=101,102
 
     Example: sart benchmark my_plan.toml --out runs/mine --only "peg_in_hole-*-d101-*"
+
+    Example: sart benchmark radii --help
 
     OUT gets benchmark.html, benchmark.json and a file of each cell in cells/. Interrupted, it
     resumes when the same command is typed again.
