@@ -121,7 +121,8 @@ def randomise_appearance(
     """The same robot and scene with a random appearance: what moves, and how, stays the same.
 
     Colours of the scene's bodies, the light, and the wrist camera's pose vary; robot and held
-    bodies keep their colours. Saved states of the one scene can be restored in the other.
+    bodies keep their colours. Saved states of the one scene can be restored in the other, unless
+    there are distractors.
 
     Args:
         robot: the robot whose camera varies.
