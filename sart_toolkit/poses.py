@@ -6,6 +6,7 @@ vectors are axis times angle [rad]. Quaternions never appear here.
 
 from __future__ import annotations
 
+import math
 import numbers
 from typing import Any
 
@@ -215,14 +216,22 @@ class StraightLine:
     def __init__(self, T_a: Array, T_b: Array) -> None:
         """From pose `T_a` to `T_b`, both `(4, 4)`."""
         self._p_a, self._p_b = T_a[:3, 3], T_b[:3, 3]
-        self._R_a = T_a[:3, :3]
-        self._rotvec = log_rotation(self._R_a.T @ T_b[:3, :3])
+        R_a = orthonormalised(T_a[:3, :3])
+        rotvec = log_rotation(R_a.T @ T_b[:3, :3])
+        self._angle = float(np.sqrt(rotvec @ rotvec))
+        x, y, z = rotvec / self._angle if self._angle > 0.0 else rotvec
+        K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        self._R_a, self._R_a_K, self._R_a_KK = R_a, R_a @ K, R_a @ K @ K
 
     def __call__(self, s: float) -> Array:
-        """The pose `(4, 4)` at fraction `s`."""
-        T = np.eye(4)
+        """The pose `(4, 4)` at fraction `s`; its rotation by Rodrigues' formula."""
+        angle = s * self._angle
+        # 1 - cos(angle), without the digits that it loses near 0.
+        versine = 2.0 * math.sin(0.5 * angle) ** 2
+        T = np.empty((4, 4))
+        T[:3, :3] = self._R_a + math.sin(angle) * self._R_a_K + versine * self._R_a_KK
         T[:3, 3] = (1.0 - s) * self._p_a + s * self._p_b
-        T[:3, :3] = orthonormalised(self._R_a @ exp_rotation(s * self._rotvec))
+        T[3] = _LAST_ROW
         return T
 
 

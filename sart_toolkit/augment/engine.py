@@ -7,7 +7,7 @@ import functools
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,20 +46,17 @@ class _Worker:
 
     def __init__(
         self,
-        make_backend: BackendFactory,
-        sources: Sequence[Source],
-        out: Output,
+        backend: Backend,
+        sources: Sequence[tuple[Demonstration, Annotation | None]],
+        files: EpisodeFiles,
         config: AugmentConfig,
         ask: Callable[[str], None] | None,
         task: Task | None,
     ) -> None:
-        numbers = [source.number for source in sources]
-        self._out, self._files = out.path, EpisodeFiles(out.path, numbers)
-        self._backend = make_backend()
-        pairs = [(source.demonstration, source.annotation) for source in sources]
-        demonstrations = [source.demonstration for source in sources]
-        executor = get_executor(config.execution, self._backend, demonstrations)
-        self._executor = executor(self._backend, pairs, config, ask, task)
+        self._backend, self._files = backend, files
+        demonstrations = [demonstration for demonstration, _ in sources]
+        executor = get_executor(config.execution, backend, demonstrations)
+        self._executor = executor(backend, sources, config, ask, task)
 
     def results(self, keys: Iterable[AttemptKey], spare: Spare = no_spare) -> Iterator[_Result]:
         """The results of attempts, one after the other, in the executor's order."""
@@ -68,7 +65,7 @@ class _Worker:
             entry = file = None
             if episode is not None:
                 entry = dataclasses.replace(self._files.write(episode), seconds=attempt.seconds)
-                file = self._out / entry.name
+                file = self._files.path / entry.name
             rejection = Rejection(attempt.outcome, attempt.detail, attempt.seconds)
             yield _Result(attempt.key, entry, rejection, file, attempt.resets)
 
@@ -78,6 +75,20 @@ class _Worker:
 
     def close(self) -> None:
         self._backend.close()
+
+
+def _worker_elsewhere(
+    make_backend: BackendFactory,
+    sources: Sequence[Source],
+    out: Output,
+    config: AugmentConfig,
+    ask: Callable[[str], None] | None,
+    task: Task | None,
+) -> _Worker:
+    """A worker that reads its sources from the dataset's folder, in whatever process it is."""
+    files = EpisodeFiles(out.path, [source.number for source in sources])
+    pairs = [(source.demonstration, source.annotation) for source in sources]
+    return _Worker(make_backend(), pairs, files, config, ask, task)
 
 
 def augment_demonstration(
@@ -147,7 +158,9 @@ def augment_sources(
     workers = Workers.of(workers)
     demonstrations = [demonstration for demonstration, _ in sources]
     allocation = Allocation(sources, config)
-    with closing(make_backend()) as backend:
+    with ExitStack() as stack:
+        backends = stack.enter_context(ExitStack())
+        backend = backends.enter_context(closing(make_backend()))
         executor = get_executor(config.execution, backend, demonstrations)
         if not workers.here and not executor.parallel:
             raise InvalidInput(
@@ -156,43 +169,63 @@ def augment_sources(
             )
         if allocation.shares:
             executor.check(backend, demonstrations, config, ask)
+        started = time.perf_counter()
         request = _request(backend, config, task)
-    started = time.perf_counter()
-    with DatasetWriter(out, sources, request, overwrite) as writer:
+        writer = stack.enter_context(DatasetWriter(out, sources, request, overwrite))
         if writer.finished is not None:
             return writer.finished
+        if workers.here:
+            # In its executor's own order.
+            worker = _Worker(backend, sources, writer.files, config, ask, task)
+            make = worker.results
+        else:
+            backends.close()
+            make_worker = functools.partial(
+                _worker_elsewhere, make_backend, writer.sources, Output(writer.path), config, ask,
+                task,
+            )  # fmt: skip
+            run = stack.enter_context(worker_map(make_worker, workers))
+
+            def make(keys: Iterable[AttemptKey], spare: Spare = no_spare) -> Iterator[_Result]:
+                return run(keys)
 
         resumed = writer.n_kept + writer.n_rejected > 0
-
-        given: set[AttemptKey] = set()
-
-        def spare(source: int, sphere: int) -> AttemptKey | None:
-            """One more attempt from a sphere, if those under way can't be enough."""
-            for key in allocation.missing(writer.tally):
-                if key[:2] == (source, sphere) and key not in given:
-                    given.add(key)
-                    return key
-            return None
-
-        resets = 0
-        make_worker = functools.partial(
-            _Worker, make_backend, writer.sources, Output(writer.path), config, ask, task
-        )
-        with _results(make_worker, workers) as results:
-            while keys := allocation.missing(writer.tally):
-                given.clear()
-                given.update(keys)
-                for key, entry, rejection, _, reset in results(keys, spare):
-                    resets += reset
-                    if entry is None:
-                        writer.reject(key, rejection)
-                    else:
-                        writer.keep(entry)
-                    if progress is not None:
-                        progress(writer.n_kept, allocation.wanted, writer.n_rejected)
+        resets = _generate(writer, allocation, make, progress)
         # How long an interrupted generation took in all, with how many resets, is not known.
         seconds, counted = (None, None) if resumed else (time.perf_counter() - started, resets)
         return _finish(writer, sources[0][0], config, allocation.shares, seconds, counted)
+
+
+def _generate(
+    writer: DatasetWriter,
+    allocation: Allocation,
+    make: Callable[[Iterable[AttemptKey], Spare], Iterator[_Result]],
+    progress: Callable[[int, int, int], None] | None,
+) -> int:
+    """Have attempts made until no more are needed or none are left; how many resets they took."""
+    given: set[AttemptKey] = set()
+
+    def spare(source: int, sphere: int) -> AttemptKey | None:
+        """One more attempt from a sphere, if those under way can't be enough."""
+        for key in allocation.missing(writer.tally):
+            if key[:2] == (source, sphere) and key not in given:
+                given.add(key)
+                return key
+        return None
+
+    resets = 0
+    while keys := allocation.missing(writer.tally):
+        given.clear()
+        given.update(keys)
+        for key, entry, rejection, _, reset in make(keys, spare):
+            resets += reset
+            if entry is None:
+                writer.reject(key, rejection)
+            else:
+                writer.keep(entry)
+            if progress is not None:
+                progress(writer.n_kept, allocation.wanted, writer.n_rejected)
+    return resets
 
 
 def _request(backend: Backend, config: AugmentConfig, task: Task | None) -> dict[str, Any]:
@@ -203,19 +236,6 @@ def _request(backend: Backend, config: AugmentConfig, task: Task | None) -> dict
         "image_size": backend.image_size,
         "config": config.to_json(),
     }
-
-
-@contextmanager
-def _results(
-    make_worker: Callable[[], _Worker], workers: Workers
-) -> Iterator[Callable[[Iterable[AttemptKey], Spare], Iterator[_Result]]]:
-    """A function that makes attempts; a single process makes them in its executor's order."""
-    if workers.here:
-        with closing(make_worker()) as worker:
-            yield worker.results
-    else:
-        with worker_map(make_worker, workers) as run:
-            yield lambda keys, spare: run(keys)
 
 
 def _finish(

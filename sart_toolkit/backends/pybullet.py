@@ -27,6 +27,7 @@ from sart_toolkit.backends.targets import PeriodTargets
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import BrokenFile
 from sart_toolkit.poses import Array, inverse
+from sart_toolkit.robots.frames import without_frames
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import (
     CameraSpec,
@@ -150,7 +151,7 @@ class PyBulletBackend(Simulator):
         """Load a body and those that move on it as one multibody."""
         c = self._client
         moving = {b.name: b for b in self.scene.bodies if b.joint and b.joint.parent == root.name}
-        with _urdf_file(root, moving.values()) as path:
+        with _urdf_file(_scene_urdf(root, moving.values())) as path:
             index = c.loadURDF(path, useFixedBase=root.mass is None, flags=_URDF_FLAGS)
         self._bodies[root.name] = index, -1
         # PyBullet's base is a body's centre of mass with its principal axes.
@@ -178,11 +179,12 @@ class PyBulletBackend(Simulator):
 
     def _load_robot(self) -> None:
         c, robot = self._client, self.robot
-        self._robot = c.loadURDF(
-            str(self._model.urdf),
-            useFixedBase=True,
-            flags=_URDF_FLAGS | p.URDF_USE_SELF_COLLISION,
-        )
+        # Each link costs time in each physics step, places of no mass as much as others.
+        bodies = without_frames(self._model.urdf)
+        with _urdf_file(bodies.urdf) as path:
+            self._robot = c.loadURDF(
+                path, useFixedBase=True, flags=_URDF_FLAGS | p.URDF_USE_SELF_COLLISION
+            )
         joints, self._links = {}, {c.getBodyInfo(self._robot)[0].decode(): -1}
         parents = {-1: -1}
         for i in range(c.getNumJoints(self._robot)):
@@ -195,7 +197,11 @@ class PyBulletBackend(Simulator):
         self._gripper = {name: joints[name] for name in robot.gripper.joint_positions(0.0)}
         self._driver = joints[robot.gripper.driver]
         self._followers = {joints[n]: ratio for n, ratio in robot.gripper.followers.items()}
-        self._tool_link = self._links[robot.tool_frame]
+        # On which link, and where there, are the tool and what it holds.
+        self._at_tool: dict[str, tuple[int, Array]] = {}
+        for name in (robot.tool_frame, *(body.name for body in self.scene.held)):
+            link, T_link_frame = bodies.frames.get(name, (name, np.eye(4)))
+            self._at_tool[name] = self._links[link], T_link_frame
         self._forces = [c.getJointInfo(self._robot, j)[10] for j in self._arm]
         for link in robot.gripper.finger_links:
             c.changeDynamics(self._robot, self._links[link], lateralFriction=1.0)
@@ -300,9 +306,10 @@ class PyBulletBackend(Simulator):
     def _poses(self) -> tuple[Array, dict[str, Array]]:
         """Where the tool is, and where the bodies are."""
         c = self._client
-        links = [self._tool_link, *(self._links[body.name] for body in self.scene.held)]
+        links, Ts_link_frame = zip(*self._at_tool.values(), strict=True)
+        states = c.getLinkStates(self._robot, links, 0, 1)
         T_world_tool, *held = (
-            _matrix(state[4], state[5]) for state in c.getLinkStates(self._robot, links, 0, 1)
+            _matrix(state[4], state[5]) @ T for state, T in zip(states, Ts_link_frame, strict=True)
         )
         Ts = {body.name: T for body, T in zip(self.scene.held, held, strict=True)}
         for name, (index, link) in self._bodies.items():
@@ -345,6 +352,7 @@ class PyBulletBackend(Simulator):
         self._touched = {}
         self._joint_path = []
         self._restored = None
+        closing: float | None = None
         for target in self._targets.rows.tolist():
             # Position gain 1 closes the whole error within one physics step. A velocity target
             # beside it would put the arm one physics step ahead of its targets.
@@ -353,10 +361,13 @@ class PyBulletBackend(Simulator):
                 targetVelocities=zeros,
                 forces=self._forces, positionGains=ones, velocityGains=ones,
             )  # fmt: skip
-            c.setJointMotorControl2(
-                robot, self._driver, p.POSITION_CONTROL, gripper.closed_position * target[n],
-                force=gripper.force, maxVelocity=gripper.speed,
-            )  # fmt: skip
+            if target[n] != closing:
+                # It stays in force until it is another.
+                closing = target[n]
+                c.setJointMotorControl2(
+                    robot, self._driver, p.POSITION_CONTROL, gripper.closed_position * closing,
+                    force=gripper.force, maxVelocity=gripper.speed,
+                )  # fmt: skip
             for index, link, joint in self._springs:
                 effort = joint.effort(c.getJointState(index, link)[0])
                 c.setJointMotorControl2(index, link, p.TORQUE_CONTROL, force=effort)
@@ -501,9 +512,8 @@ class _Drawing:
         return self._found[frame, gripper]
 
 
-@contextmanager
-def _urdf_file(root: Body, moving: Iterable[Body]) -> Iterator[str]:
-    """A URDF of a body and of those that move on it, for as long as it is read."""
+def _scene_urdf(root: Body, moving: Iterable[Body]) -> str:
+    """A URDF of a body and of those that move on it."""
     robot = ET.Element("robot", name=root.name)
     for body in (root, *moving):
         robot.append(rigid_link(body.name, body.shapes, body.mass or 0.0))
@@ -515,10 +525,16 @@ def _urdf_file(root: Body, moving: Iterable[Body]) -> Iterator[str]:
             ET.SubElement(joint, "axis", xyz=" ".join(map(str, body.joint.axis)))
             limits = {"lower": body.joint.lower, "upper": body.joint.upper}
             ET.SubElement(joint, "limit", {k: str(v) for k, v in limits.items()})
+    return ET.tostring(robot, encoding="unicode")
+
+
+@contextmanager
+def _urdf_file(urdf: str) -> Iterator[str]:
+    """A file of a URDF, for as long as it is read."""
     handle, path = tempfile.mkstemp(suffix=".urdf")
     try:
-        with os.fdopen(handle, "wb") as file:
-            ET.ElementTree(robot).write(file)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(urdf)
         yield path
     finally:
         os.unlink(path)

@@ -192,10 +192,9 @@ class _Image:
 
     Attributes:
         depth: along z [m], the camera's farthest where nothing was hit yet.
-        shades: of each body drawn, its pixels, normals `(k, 3)` in the camera's frame, and which of
-            them each pixel shows.
+        shades: of each body drawn, later ones before earlier ones, its number, its pixels, normals
+            `(k, 3)` in the camera's frame, and which of them each pixel shows.
         colour: place in the palette, -1 where nothing was hit yet.
-        body: the number of the body hit.
     """
 
     def __init__(self, camera: CameraSpec, size: tuple[int, int]) -> None:
@@ -203,16 +202,15 @@ class _Image:
         self._rays = _rays(camera.fov_y_deg, *size)
         n = self._rays.shape[1]
         self.depth = np.full(n, camera.far, np.float32)
-        self.shades: list[tuple[_Indices, _Floats, _Indices]] = []
+        self.shades: list[tuple[int, _Indices, _Floats, _Indices]] = []
         self.colour = np.full(n, -1, np.int16)
-        self.body = np.full(n, -1, np.int16)
 
     def copy(self) -> _Image:
         """The same image, to be drawn on alone."""
         made = _Image.__new__(_Image)
         made._camera, made._size, made._rays = self._camera, self._size, self._rays
-        made.depth, made.shades = self.depth.copy(), self.shades.copy()
-        made.colour, made.body = self.colour.copy(), self.body.copy()
+        made.depth, made.colour = self.depth.copy(), self.colour.copy()
+        made.shades = self.shades.copy()
         return made
 
     def add(self, number: int, body: _Body, T_camera_body: Array, corners: Array) -> None:
@@ -227,8 +225,7 @@ class _Image:
             pixels, depth, triangles, normals, shown = self._cast(body, T_camera_body, pixels)
             self.colour[pixels] = body.colours[triangles]
         self.depth[pixels] = depth
-        self.shades.append((pixels, normals, shown))
-        self.body[pixels] = number
+        self.shades.append((number, pixels, normals, shown))
 
     def _cast(
         self, body: _Body, T_camera_body: Array, pixels: _Indices
@@ -265,15 +262,21 @@ class _Image:
         normals = body.planes[:, :3] @ T_camera_body[:3, :3].T
         offsets = body.planes[:, 3] + normals @ T_camera_body[:3, 3]
         slopes = normals.astype(np.float32) @ self._rays.take(pixels, axis=1)
+        at_corners = normals @ self._rays[:, self._corner_pixels()]
         depth, face = self.depth[pixels], np.full(len(pixels), -1)
         # The camera sees a face only from the outer side of its plane.
         for seen in np.flatnonzero(offsets < 0):
+            others = [other for other in range(len(offsets)) if other != seen]
             with np.errstate(divide="ignore", invalid="ignore"):
+                z = offsets[seen] / at_corners[seen]
+                # A face is convex: what all corners of the image show, all of the image shows.
+                everywhere = (z > self._camera.near).all() and (
+                    at_corners[others] * z <= offsets[others, None]
+                ).all()
                 z = np.float32(offsets[seen]) / slopes[seen]
                 inside = (z > self._camera.near) & (z < depth)
-                for other in range(len(offsets)):
-                    if other != seen:
-                        inside &= slopes[other] * z <= np.float32(offsets[other] + _EDGE)
+                for other in [] if everywhere else others:
+                    inside &= slopes[other] * z <= np.float32(offsets[other] + _EDGE)
             depth[inside], face[inside] = z[inside], seen
         at = np.flatnonzero(face >= 0)
         return pixels[at], depth[at], normals.astype(np.float32), face[at]
@@ -298,8 +301,16 @@ class _Image:
         right, bottom = np.minimum(np.ceil(at.max(axis=0)) + 1, self._size).astype(int)
         if left >= right or top >= bottom:
             return _NOTHING
-        pixels = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)).ravel()
-        return pixels[self.depth[pixels] > corners[:, 2].min()]
+        nearest = corners[:, 2].min()
+        if right - left == width:
+            first = top * width
+            return np.flatnonzero(self.depth[first : bottom * width] > nearest) + first
+        pixels = np.arange(top, bottom)[:, None] * width + np.arange(left, right)
+        return pixels[self.depth.reshape(height, width)[top:bottom, left:right] > nearest]
+
+    def _corner_pixels(self) -> list[int]:
+        width, height = self._size
+        return [0, width - 1, (height - 1) * width, height * width - 1]
 
     def facing(self, to_light: Array) -> _Floats:
         """The cosine of the angle between surface and light `(n,)`, 0 on far sides.
@@ -307,7 +318,7 @@ class _Image:
         `to_light (3,)` is the light's direction in the camera's frame.
         """
         facing = np.zeros(len(self.depth), np.float32)
-        for pixels, normals, shown in self.shades:
+        for _, pixels, normals, shown in self.shades:
             facing[pixels] = (normals @ to_light.astype(np.float32)).take(shown)
         return np.maximum(facing, np.float32(0))
 
@@ -329,6 +340,9 @@ class _Image:
             to_light: the light's direction `(3,)` in the camera's frame.
         """
         hidden = np.zeros(len(pixels), bool)
+        hit = np.full(len(self.depth), -1)
+        for number, at, _, _ in self.shades:
+            hit[at] = number
         # Two directions across the light, and the one towards it.
         R = np.linalg.svd(to_light[None])[2][[1, 2, 0]]
         R[2] = to_light
@@ -342,7 +356,7 @@ class _Image:
         for number, body in enumerate(bodies):
             own = asked[number]
             if len(body.planes):
-                own &= self.body[pixels] != number
+                own &= hit[pixels] != number
             at = np.flatnonzero(own)
             if len(at):
                 T_camera_body = Ts_camera_body[number].astype(np.float32)

@@ -15,7 +15,7 @@ from sart_toolkit.errors import BrokenFile
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.spec import SceneSpec
 
-_VERSION = 5
+_VERSION = 6
 
 
 def scene_digest(model: RobotModel, scene: SceneSpec) -> str:

@@ -28,8 +28,7 @@ class PeriodTargets:
 
     def rest_at(self, q: Array, gripper: float) -> None:
         """Stay, as before, at joints `(n,)` [rad] and a gripper target in [0, 1]."""
-        self.last = np.append(q, gripper)
-        self.rows = np.repeat(self.last[None], self._steps, axis=0)
+        self._stay(np.append(q, gripper))
 
     def command(self, q: Array, gripper: float) -> CommandSent:
         """Take a command as `Backend.command` has it, for the next period.
@@ -51,7 +50,10 @@ class PeriodTargets:
 
     def advance(self) -> None:
         """A control period has passed: the last targets stay in force."""
-        self.rest_at(self.rows[-1, :-1], self.rows[-1, -1])
+        self._stay(self.rows[-1])
+
+    def _stay(self, at: Array) -> None:
+        self.last, self.rows = at, np.broadcast_to(at, (self._steps, len(at)))
 
     def to_json(self) -> dict[str, Any]:
         """The targets as JSON values, for a saved state."""

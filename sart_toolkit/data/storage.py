@@ -920,7 +920,7 @@ def save_demonstration(path: Path, demonstration: Demonstration) -> None:
 
 
 # The dictionary holds several states, so that the next is found to be like the last.
-_STATES_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 0, "dict_size": 2**20}]
+_STATES_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 0, "dict_size": 2**19}]
 # States may be so much larger than they are packed, and a few always so large.
 _STATES_RATIO = 1000
 _STATES_BYTES = 256 * 2**20

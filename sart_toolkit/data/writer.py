@@ -85,11 +85,15 @@ def check_sources(sources: Sources) -> None:
 
 
 class EpisodeFiles:
-    """Writes the episode files of a dataset directory; picklable, so that any process can."""
+    """Writes the episode files of a dataset directory; picklable, so that any process can.
+
+    Attributes:
+        path: the directory.
+    """
 
     def __init__(self, path: Path, numbers: Sequence[int]) -> None:
         """Write to the directory `path`, whose sources had `numbers` where they were generated."""
-        self._path, self._numbers = path, tuple(numbers)
+        self.path, self._numbers = path, tuple(numbers)
 
     def write(self, episode: Episode) -> EpisodeEntry:
         """What the index is to say of an episode, which is on the disk by then.
@@ -99,7 +103,7 @@ class EpisodeFiles:
         """
         p = episode.provenance
         key = AttemptKey(p.source, p.sphere, p.k)
-        return entry_of(episode, save_episode(self._path / episode_name(key), episode))
+        return entry_of(episode, save_episode(self.path / episode_name(key), episode))
 
     def take(self, path: Path, entry: EpisodeEntry) -> None:
         """Have the file of an episode from another dataset, linked if possible.
@@ -109,12 +113,12 @@ class EpisodeFiles:
             CannotWrite: the disk refuses.
         """
         check_bytes(path, "episode")
-        link_file(path, self._path / entry.name)
+        link_file(path, self.path / entry.name)
 
     def hold(self, entry: EpisodeEntry) -> bool:
         """Whether an episode's file is there and whole, and what the entry says."""
         try:
-            episode = load_episode(self._path / entry.name, entry.content_hash)
+            episode = load_episode(self.path / entry.name, entry.content_hash)
             # How long the robot moved isn't in the file.
             number = self._numbers[entry.source]
             said = dataclasses.replace(entry, source=number, seconds=None)

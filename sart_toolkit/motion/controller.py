@@ -10,7 +10,6 @@ from sart_toolkit.motion.config import ControllerConfig
 from sart_toolkit.motion.interpolator import JointInterpolator
 from sart_toolkit.poses import (
     Array,
-    angle_between,
     check_array,
     check_pose,
     distance,
@@ -181,6 +180,8 @@ class ToolController:
 
         Only what adds to the lead counts, and what is left of it fades.
         """
+        if np.array_equal(self._interpolator.sent, self._q):
+            return _FADING**n * self._slack
         ahead = _offsets(measured, self._T)
         lags = _offsets(self.model.fk(self._interpolator.sent), self._T)
         along = [
@@ -197,11 +198,11 @@ class ToolController:
         result = desired.copy()
         offset, rotvec = _offsets(measured, desired)
         lead, lead_angle = self._most if slack is None else self._most + slack
-        far = float(np.linalg.norm(offset))
+        far, angle = float(np.linalg.norm(offset)), float(np.linalg.norm(rotvec))
         if far > lead:
             result[:3, 3] = measured[:3, 3] + offset * (lead / far)
-        if angle_between(measured[:3, :3], desired[:3, :3]) > lead_angle:
-            R = measured[:3, :3] @ exp_rotation(rotvec * (lead_angle / np.linalg.norm(rotvec)))
+        if angle > lead_angle:
+            R = measured[:3, :3] @ exp_rotation(rotvec * (lead_angle / angle))
             result[:3, :3] = orthonormalised(R)
         return result
 

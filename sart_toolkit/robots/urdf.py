@@ -54,6 +54,8 @@ _MADE_WITH = ("trimesh", "scipy", "numpy")
 # Faces that meet at a sharper angle show an edge.
 _CREASE_DEG = 30.0
 _GRIPPER_PREFIX = "gripper_"
+# What a link of no mass of its own gets [kg].
+FRAME_MASS = 1e-3
 _MANIFEST = "manifest.json"
 _MESH_TYPES = (".dae", ".glb", ".obj", ".off", ".ply", ".stl")
 _MAX_MESH_BYTES = 100 << 20
@@ -253,9 +255,9 @@ def _compose(
         inertial = link.find("inertial")
         if inertial is None:
             # A simulator would give a link without inertia one kilogram.
-            link.append(_inertial(1e-3, np.zeros(3), 1e-6 * np.eye(3)))
+            link.append(_inertial(FRAME_MASS, np.zeros(3), 1e-6 * np.eye(3)))
         elif inertial.find("inertia") is None:
-            mass = float(_found(inertial, "mass").get("value", ""))
+            mass = float(found_element(inertial, "mass").get("value", ""))
             moment = 0.4 * max(mass, 1e-3) * _BALL_RADIUS**2
             inertial.append(_inertia(moment * np.eye(3)))
     _add_armature(robot, spec)
@@ -271,7 +273,7 @@ def _check_tree(name: str, robot: ET.Element) -> None:
     """
     parent_of: dict[str, str] = {}
     for joint in robot.findall("joint"):
-        parent, child = (_found(joint, tag).get("link", "") for tag in ("parent", "child"))
+        parent, child = (found_element(joint, tag).get("link", "") for tag in ("parent", "child"))
         if child in parent_of:
             raise InvalidInput(
                 f"{name}: link {child!r} is the child of two joints, expected one; remove one"
@@ -294,14 +296,17 @@ def _check_tree(name: str, robot: ET.Element) -> None:
         joined.update(chain)
     for joint in robot.findall("joint"):
         # A fixed joint is a frame too, at its child's place.
-        if joint.get("name") in links and joint.get("name") != _found(joint, "child").get("link"):
+        if joint.get("name") in links and joint.get("name") != found_element(joint, "child").get(
+            "link"
+        ):
             raise InvalidInput(
                 f"{name}: joint {joint.get('name')!r} has the name of a link that isn't its child; "
                 "rename it"
             )
 
 
-def _found(element: ET.Element, tag: str) -> ET.Element:
+def found_element(element: ET.Element, tag: str) -> ET.Element:
+    """A child of an element that is there for certain."""
     found = element.find(tag)
     assert found is not None
     return found
@@ -314,13 +319,13 @@ def _add_armature(robot: ET.Element, spec: RobotSpec) -> None:
     for joint in robot.findall("joint"):
         if joint.get("name") not in moving or not spec.gripper.armature:
             continue
-        inertial = _found(links[_found(joint, "child").get("link")], "inertial")
+        inertial = found_element(links[found_element(joint, "child").get("link")], "inertial")
         part, names = (
             ("mass", ["value"])
             if joint.get("type") == "prismatic"
             else ("inertia", ["ixx", "iyy", "izz"])
         )
-        element = _found(inertial, part)
+        element = found_element(inertial, part)
         for name in names:
             element.set(name, f"{max(float(element.get(name, 0)), spec.gripper.armature):.9g}")
 
@@ -424,7 +429,7 @@ def link_parts(link: ET.Element, folder: Path) -> list[Part]:
         if mesh is None:
             parts.append(ShapePart(_shape(element)))
         else:
-            parts.append(HullPart(_moved(_loaded(mesh, folder).vertices, _place(element))))
+            parts.append(HullPart(_moved(_loaded(mesh, folder).vertices, element_pose(element))))
     return parts
 
 
@@ -439,7 +444,7 @@ def drawn_triangles(link: ET.Element, folder: Path) -> tuple[Array, Faces]:
         if mesh is None:
             continue
         loaded = _loaded(mesh, folder)
-        corners.append(_moved(loaded.vertices, _place(element)))
+        corners.append(_moved(loaded.vertices, element_pose(element)))
         triangles.append(np.asarray(loaded.faces, np.intp) + count)
         count += len(loaded.vertices)
     return np.concatenate(corners), np.concatenate(triangles)
@@ -459,7 +464,7 @@ def drawn_elements(
     """
     found: list[tuple[Shape | trimesh.Trimesh, Array, tuple[float, float, float, float]]] = []
     for visual in link.findall("visual"):
-        red, green, blue, alpha = _floats(_found(visual, "material/color").get("rgba", ""))
+        red, green, blue, alpha = _floats(found_element(visual, "material/color").get("rgba", ""))
         mesh = visual.find("geometry/mesh")
         what: Shape | trimesh.Trimesh
         if mesh is None:
@@ -469,7 +474,7 @@ def drawn_elements(
             loaded = trimesh.load(path, force="mesh", process=False)
             assert isinstance(loaded, trimesh.Trimesh)
             what = loaded
-        found.append((what, _place(visual), (red, green, blue, alpha)))
+        found.append((what, element_pose(visual), (red, green, blue, alpha)))
     return found
 
 
@@ -497,11 +502,11 @@ def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path) -> None:
             mesh = element.find("geometry/mesh")
             if mesh is None:
                 mesh = ET.SubElement(ET.SubElement(element, "geometry"), "mesh")
-            T = inverse(_place(element))
+            T = inverse(element_pose(element))
             hull = trimesh.Trimesh(_moved(part.points, T)).convex_hull
             _export(hull, mesh, work, f"collision_{index}.obj")
         elif index >= len(own):
-            element.append(_origin(part.shape.T_body_shape))
+            element.append(origin_element(part.shape.T_body_shape))
             element.append(_geometry(part.shape))
 
 
@@ -522,7 +527,7 @@ def _moved(points: Array, T: Array) -> Array:
     return np.asarray(points, np.float64) @ T[:3, :3].T + T[:3, 3]
 
 
-def _place(element: ET.Element) -> Array:
+def element_pose(element: ET.Element) -> Array:
     """An element's pose `(4, 4)` in its link."""
     origin = element.find("origin")
     given = {} if origin is None else origin.attrib
@@ -535,8 +540,8 @@ def _floats(text: str) -> list[float]:
 
 def _shape(element: ET.Element) -> Shape:
     """The primitive of a visual or collision element, in the link's frame."""
-    T = _place(element)
-    shape = _found(element, "geometry")[0]
+    T = element_pose(element)
+    shape = found_element(element, "geometry")[0]
     if shape.tag == "box":
         x, y, z = _floats(shape.get("size", ""))
         return Shape("box", (x, y, z), T)
@@ -610,7 +615,8 @@ def _check_mesh(mesh: trimesh.Trimesh, link: str, kind: str, file: str) -> None:
         )
 
 
-def _origin(T: Array) -> ET.Element:
+def origin_element(T: Array) -> ET.Element:
+    """An `origin` element of a pose `(4, 4)`."""
     R = T[:3, :3]
     pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
     if np.cos(pitch) > 1e-6:
@@ -653,7 +659,7 @@ def add_joint(
 ) -> ET.Element:
     """A joint of a URDF's `robot` element, by its kind (`fixed`, `revolute` or `prismatic`)."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
-    joint.append(_origin(T_parent_child))
+    joint.append(origin_element(T_parent_child))
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
     return joint
@@ -666,7 +672,7 @@ def rigid_link(name: str, shapes: Sequence[Shape], mass: float) -> ET.Element:
     for index, shape in enumerate(shapes):
         for kind in ("visual", "collision") if shape.collides else ("visual",):
             element = ET.SubElement(link, kind)
-            element.append(_origin(shape.T_body_shape))
+            element.append(origin_element(shape.T_body_shape))
             element.append(_geometry(shape))
             if kind == "visual":
                 element.append(_material(f"{name}_{index}", shape.rgba))

@@ -334,7 +334,11 @@ def make_bench(
     model = RobotModel(robot, scene.held)
     here, ready = _whereabouts(robot_name)
     bench = Bench(backend_name, robot_name, scene_name, backend, scene, model, here, ready, ready)
-    bench.reset()
+    try:
+        bench.reset()
+    except BaseException:
+        backend.close()
+        raise
     return bench
 
 
