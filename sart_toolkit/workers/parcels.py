@@ -177,7 +177,9 @@ def own_modules() -> list[Path]:
     folders = [_PACKAGE, *map(Path, others)]
     files = [getattr(module, "__file__", None) for module in list(sys.modules.values())]
     paths = {Path(os.path.abspath(file)) for file in files if file is not None}
-    return [path for path in sorted(paths) if path.suffix == ".py" and not _within(path, folders)]
+    # Some modules name a file that isn't there, as torch's `_classes.py`.
+    own = (path for path in sorted(paths) if path.suffix == ".py" and path.is_file())
+    return [path for path in own if not _within(path, folders)]
 
 
 def _script() -> str | None:
