@@ -23,6 +23,7 @@ import numpy as np
 from sart_toolkit.augment import STRATEGIES
 from sart_toolkit.backends import BACKENDS, get_backend, make_backend
 from sart_toolkit.data.dataset import Dataset, load_dataset
+from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.records import (
     DEFAULT_RATES,
     Annotation,
@@ -70,6 +71,7 @@ if TYPE_CHECKING:
     from sart_toolkit.benchmark.plans import Plan
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
     from sart_toolkit.collision.world import CollisionWorld
+    from sart_toolkit.data.formats.format import Format, Given
     from sart_toolkit.evaluate.rollout import Film, Rollout
     from sart_toolkit.learn.policy import Policy
     from sart_toolkit.learn.skill import SkillConfig
@@ -82,12 +84,14 @@ if TYPE_CHECKING:
     RobotLike = str | RobotSpec
     TaskLike = str | Task | type[Task]
     BackendLike = str | type[Backend]
+    FormatLike = str | Format | type[Format]
     Steer = Callable[[Path, DeviceSetup, Device, Placement, SessionConfig], Demonstration]
 
 _log = logging.getLogger(__name__)
 _TABLES: Mapping[str, Mapping[str, str]] = {
     "backend": BACKENDS,
     "device": DEVICES,
+    "format": FORMATS,
     "policy": POLICIES,
     "robot": ROBOTS,
     "strategy": STRATEGIES,
@@ -844,6 +848,152 @@ def split(
     if n is not None:
         return {"": shorten_dataset(found, out, n, overwrite, shown)}
     return split_sources(found, out, overwrite, shown)
+
+
+def export(
+    dataset: Path,
+    out: Path,
+    format: FormatLike,
+    *,
+    instruction: str | None = None,
+    depth: bool = True,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """What was written when a dataset, or a demonstration, is exported to a format of the field.
+
+    Args:
+        dataset: directory from `augment`, `merge` or `split`, or a demonstration's file.
+        out: the file or directory to write.
+        format: how; see `data.formats`.
+        instruction: the task in a sentence; the first of the task's docstring if left out, or its
+            name in words where the task can't be found.
+        depth: whether depth images are written.
+        task, robot: in place of those that the recording notes.
+        overwrite: whether an earlier export may be replaced.
+        progress: called with the trajectories done.
+
+    Raises:
+        UnknownName: no such format, or the task or robot that is given can't be found.
+        MissingExtra: the format needs a library that isn't installed.
+        MissingFile, BrokenFile, Mismatch, InvalidInput, OutputExists, CannotWrite: as
+            `export_dataset`.
+    """
+    check_names(format=format, task=task, robot=robot)
+    found = load_dataset(dataset) if Path(dataset).is_dir() else load_demonstration(dataset)
+    from sart_toolkit.data.formats.format import about_dataset
+    from sart_toolkit.data.formats.transfer import export_dataset
+
+    made = get_format(format)
+    first = found if isinstance(found, Demonstration) else found.sources[0].demonstration
+    try:
+        words = (task_of(first, task).__doc__ or "").partition("\n")[0].rstrip(".")
+    except UnknownName:
+        if task is not None:
+            raise
+        words = ""
+    try:
+        joints = robot_of(first, robot).arm_joints
+    except UnknownName:
+        if robot is not None:
+            raise
+        joints = ()
+    about = about_dataset(found, instruction or words, joints, depth)
+    export_dataset(found, made, out, about, overwrite, lambda *counts: progress("export", *counts))
+    return {
+        "format": made.name,
+        "instruction": about.instruction,
+        "trajectories": about.n_trajectories,
+        "bytes": _size(Path(out)),
+    }
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of all files in a directory."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def import_recordings(
+    path: Path,
+    out: Path,
+    format: FormatLike | None = None,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    gripper_range: tuple[float, float] | None = None,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> list[Path]:
+    """The demonstrations' files that are made of recordings in a format of the field.
+
+    Args:
+        path: a recording, or a directory of several.
+        out: the HDF5 file to write; for a directory, the directory of as many.
+        format: what it is; found out if left out.
+        task, robot: what it is of, where the file doesn't say so.
+        gripper_range: what the file has for an open and for a closed gripper, where it doesn't say.
+        overwrite: whether earlier files may be replaced.
+        progress: called with the recordings done.
+
+    Raises:
+        UnknownName: the format, the task or the robot can't be found.
+        MissingFile, BrokenFile: it can't be read, or is of no format that is read.
+        InvalidInput: the format isn't read, or something is said neither by the file nor here.
+        OutputExists, CannotWrite: as `check_writable` and `save_demonstration`.
+    """
+    check_names(format=format, task=task, robot=robot)
+    path, out = Path(path), Path(out)
+    if not path.exists():
+        raise MissingFile(f"{path}: no such file or directory; check the path")
+    check_writable(out, overwrite)
+    from sart_toolkit.data.formats.format import reader_of
+
+    reader, found = reader_of(path, None if format is None else get_format(format))
+    given = _given(task, robot, gripper_range)
+    single = found == [path]
+    paths = [out] if single else [demonstration_path(out, i) for i in range(len(found))]
+    for i, (recording, target) in enumerate(zip(found, paths, strict=True)):
+        with OutputLock(target):
+            save_demonstration(target, reader.read(recording, given))
+        progress("import", i + 1, len(found))
+    return paths
+
+
+def _given(
+    task: TaskLike | None, robot: RobotLike | None, gripper_range: tuple[float, float] | None
+) -> Given:
+    """What a person says of a recording, with the kinematics of the robot."""
+    from sart_toolkit.data.formats.format import Given
+
+    said: dict[str, Any] = {"gripper_range": gripper_range}
+    given = {"task": task, "robot": robot}
+    found = {k: reference_to(k, v, _TABLES[k]) for k, v in given.items() if v is not None}
+    references = {kind: reference for kind, reference in found.items() if reference is not None}
+    if task is not None:
+        said["task"] = get_task(task).name
+    if robot is not None:
+        from sart_toolkit.robots.model import RobotModel
+
+        model = RobotModel(get_robot(robot))
+        said |= {"robot": model.spec.name, "fk": model.fk, "cameras": model.mounted_cameras()}
+    return Given(references=references, **said)
+
+
+def check_export(path: Path, format: FormatLike) -> Sequence[str]:
+    """What a reader of a format would fail on in what is said to be of it; empty if all is well.
+
+    Raises:
+        UnknownName: no such format.
+        MissingFile: there is nothing.
+        MissingExtra: the format needs a library that isn't installed.
+    """
+    check_names(format=format)
+    if not Path(path).exists():
+        raise MissingFile(f"{path}: no such file or directory; check the path")
+    return get_format(format).problems(path)
 
 
 @_alone

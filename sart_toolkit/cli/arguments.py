@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sart_toolkit.augment import STRATEGIES
+from sart_toolkit.data.formats import FORMATS
 from sart_toolkit.errors import InvalidInput
 
 
@@ -476,13 +477,28 @@ class Validate:
 
     Example: sart validate dataset --replay
 
+    Example: sart validate peg_lerobot --format lerobot
+
     With --replay every trajectory is executed to the end of the task besides, commanded at the rate
     of a policy, and DATASET/replay.json says which reach the goal. That resumes when interrupted.
+
+    With --format, what is checked is a dataset in a format of the field, anyone's: that it holds
+    what readers of the format rely on, which often fail on it only when they come to the place.
     """
 
     dataset: Annotated[
-        Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment`.")
+        Positional[Path],
+        arg(
+            metavar="DATASET",
+            help="Directory from `sart augment`; with --format, a path of that format.",
+        ),
     ]
+    format: Annotated[
+        str | None,
+        _optional(
+            "REF", f"Format of DATASET: {', '.join(FORMATS)}, or your own; ours if left out."
+        ),
+    ] = None
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
     backend: _NOTED_BACKEND = None
@@ -549,6 +565,86 @@ class Split:
     ] = None
     by_source: Annotated[bool, arg(help="A part for each demonstration.")] = False
     seed: Annotated[int, arg(help="Seed of which episodes the --parts get.")] = 0
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a dataset in a format of the field, for others' policies and tools.
+
+    Example: sart export dataset --format lerobot --out peg_lerobot
+
+    Example: sart export dataset --format robomimic --out peg.hdf5
+
+    Example: sart export dataset --format zarr --out peg.zarr --no-depth
+
+    Example: sart export demo.h5 --format rmb --out recordings
+
+    Every trajectory is written whole: a generated segment, then its demonstration from where it
+    rejoins. lerobot, rmb, rmb_hdf5 and zarr are
+    directories, robomimic is a file.
+    """
+
+    dataset: Annotated[
+        Positional[Path],
+        arg(
+            metavar="DATASET",
+            help="Directory from `sart augment`, `merge` or `split`, or a demonstration.",
+        ),
+    ]
+    out: Annotated[Path, arg(help="File or directory to write.")]
+    format: Annotated[str, arg(metavar="REF", help=f"Format: {', '.join(FORMATS)}, or your own.")]
+    instruction: Annotated[
+        str | None,
+        _optional(
+            "TEXT", "The task in a sentence, as policies are told it; the task's own if left out."
+        ),
+    ] = None
+    depth: Annotated[bool, arg(help="Leave depth images out.")] = True
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Import:
+    """Make demonstrations of recordings in a format of the field: RMB, both variants.
+
+    Example: sart import peg_in_hole_0000.rmb --out demo.h5
+
+    Example: sart import recordings --out demos
+
+    Example: sart import cable.rmb --out demo.h5 --task cable.py:Cable --robot my_ur5e.py:UR5E
+        --gripper-range 0,255
+
+    What a file doesn't say has to be said: of a recording from elsewhere the task, the robot (its
+    tool frame, and where its cameras are mounted), and the range of its gripper.
+    """
+
+    file: Annotated[
+        Positional[Path],
+        arg(metavar="FILE", help="A recording, .rmb or .hdf5, or a directory of several."),
+    ]
+    out: Annotated[Path, arg(help="HDF5 file to write; of several, the directory of as many.")]
+    format: Annotated[
+        str | None, _optional("REF", "Format, as for export; found out if left out.")
+    ] = None
+    task: Annotated[
+        str | None, _optional("REF", f"Task, as {_REF}, where the file doesn't say it.")
+    ] = None
+    robot: Annotated[
+        str | None, _optional("REF", f"Robot, as {_REF}, where the file doesn't say it.")
+    ] = None
+    gripper_range: Annotated[
+        str | None,
+        _optional(
+            "OPEN,CLOSED",
+            "What the file has for an open and for a closed gripper, such as 0,255, where it "
+            "doesn't say it.",
+        ),
+    ] = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 

@@ -21,6 +21,8 @@ _UNITS = {
     "merge": "episode",
     "split": "episode",
     "validate": "episode",
+    "export": "trajectory",
+    "import": "recording",
     "read": "trajectory",
     "train": "step",
     "sweep": "training",

@@ -54,6 +54,8 @@ VERBS: Mapping[str, Verb] = {
     "validate": Verb(arguments.Validate, "sart_toolkit.cli.augment:validate_verb"),
     "merge": Verb(arguments.Merge, "sart_toolkit.cli.combine:merge_verb"),
     "split": Verb(arguments.Split, "sart_toolkit.cli.combine:split_verb"),
+    "export": Verb(arguments.Export, "sart_toolkit.cli.formats:export_verb"),
+    "import": Verb(arguments.Import, "sart_toolkit.cli.formats:import_verb"),
     "train": Verb(arguments.Train, "sart_toolkit.cli.train:train_verb"),
     "evaluate": Verb(arguments.Evaluate, "sart_toolkit.cli.train:evaluate_verb"),
     "compare": Verb(arguments.Compare, "sart_toolkit.cli.compare:compare_verb"),
