@@ -198,6 +198,7 @@ from .errors import (
 from .errors import (
     Unreachable as Unreachable,
 )
+from .evaluate.compare import compare_rollouts as compare_rollouts
 from .evaluate.rollout import (
     EvaluateConfig as EvaluateConfig,
 )
@@ -223,6 +224,7 @@ from .pipeline import check_export as check_export
 from .pipeline import export as export
 from .pipeline import import_recordings as import_recordings
 from .pipeline import run as run
+from .pipeline import run_benchmark as run_benchmark
 from .pipeline import run_skill as run_skill
 from .pipeline import train_seeds as train_seeds
 from .poses import inverse as inverse

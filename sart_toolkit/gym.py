@@ -116,7 +116,7 @@ class SartEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         self._robot = get_robot(robot if robot is not None else self.task.robot)
         self._cameras, self._yaw_deg, self._rates = tuple(cameras), yaw_deg, rates
         self._vary = vary_appearance
-        self.task.sample_placement(np.random.default_rng(0), yaw_deg)
+        self.task.check_operable(yaw_deg)
         self._backend: Backend | None = make_backend(
             backend, self._robot, self.task.scene, image_size, rates
         )

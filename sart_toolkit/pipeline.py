@@ -33,7 +33,7 @@ from sart_toolkit.data.records import (
     Referring,
     library_versions,
 )
-from sart_toolkit.data.schemas import DatasetFile, EvaluationFile, RunFile
+from sart_toolkit.data.schemas import DatasetFile, EvaluationFile, RunFile, TrainingFile
 from sart_toolkit.data.storage import (
     OutputLock,
     check_writable,
@@ -52,6 +52,7 @@ from sart_toolkit.errors import (
     MissingFile,
     OutputExists,
     UnknownName,
+    unknown_name,
 )
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.record.devices import DEVICES, make_device
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
     from sart_toolkit.backends.interface import Backend, BackendFactory
+    from sart_toolkit.benchmark.plans import Plan
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
     from sart_toolkit.collision.world import CollisionWorld
     from sart_toolkit.data.formats.format import Format, Given
@@ -322,6 +324,7 @@ def record(
 
     found = get_task(task)
     spec, scene = get_robot(robot or found.robot), found.scene
+    found.check_operable(yaw_deg)
     rng = np.random.default_rng(seed)
     at = found.sample_placement(rng, yaw_deg) if placement == "random" else Placement()
     references = {
@@ -1329,6 +1332,7 @@ def run(
         ("evaluate", evaluation, lambda: evaluate(
             skill, evaluation, task=task, robot=robot, backend=backend, workers=workers,
             device=device, progress=progress, episodes=episodes, eval_seed=eval_seed, videos=2,
+            final_images=True,
         )),
     ]  # fmt: skip
     for name, result, carry_out in steps:
@@ -1383,6 +1387,163 @@ def _resumed(out: Path, wanted: Mapping[str, Any], overwrite: bool) -> dict[str,
     else:
         check_writable(out)
     return {"config": wanted, "stages": {}}
+
+
+def run_benchmark(
+    plan: str | Path | Plan,
+    out: Path | str,
+    *,
+    changes: Mapping[str, Any] | None = None,
+    only: str | None = None,
+    store: Path | None = None,
+    workers: int | Workers = 1,
+    command: str = "sart_toolkit.run_benchmark",
+    dry_run: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """The result of a benchmark's plan in directory `out`: see `benchmark.runner.run_plan`.
+
+    Args:
+        plan: a name in `benchmark.plans.PLANS`, a TOML file, or the plan itself.
+        out: directory to write; an interrupted benchmark resumes.
+        changes: of a name or file, values of cells' fields in place of those in it.
+        only: a pattern of the names of cells; all if left out.
+        store: directory of the stages' results, which plans may share; `out`/stages if left out.
+        workers: how many processes, or `Workers` elsewhere.
+        command: how it was asked for, kept with the result.
+        dry_run: only say what is missing and what it would take: see `preview_plan`.
+        progress: called with the jobs done of each stage.
+
+    Raises:
+        UnknownName: no such plan, cell or field, or a reference of a cell leads to nothing.
+        MissingFile, BrokenFile: the plan's file can't be read.
+        InvalidInput: a value in it is not acceptable.
+        CannotWrite, SartError: as `run_plan`.
+    """
+    from sart_toolkit.benchmark.plans import Plan, read_plan
+
+    found = plan if isinstance(plan, Plan) else read_plan(plan, changes)
+    if changes and found is plan:
+        raise InvalidInput("changes: are for a plan's name or file; change the plan itself")
+    found = found if only is None else found.only(only)
+    for cell in found.cells:
+        check_names(
+            task=cell.task, backend=cell.backend, strategy=cell.strategy, policy=cell.policy
+        )
+        check_names(backend=cell.evaluate_on)
+    from sart_toolkit.benchmark.jobs import jobs_of
+    from sart_toolkit.benchmark.runner import preview_plan, run_plan
+
+    # What can't work should be said before hours are spent.
+    for cell in found.cells:
+        for stage, job in jobs_of(cell).items():
+            _stage_options(stage, job.options)
+    if dry_run:
+        return preview_plan(found, Path(out), workers, store)
+    return run_plan(
+        found, Path(out), _carry_out, workers, store,
+        {"command": command, "machine": machine()}, progress,
+    )  # fmt: skip
+
+
+def _stage_options(stage: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON values of a benchmark's stage as the options of the function that carries it out.
+
+    Raises:
+        UnknownName, InvalidInput: one is not acceptable.
+    """
+    from sart_toolkit.annotate.suggest import SuggestConfig
+    from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.data.sampling import SamplingConfig
+    from sart_toolkit.evaluate.rollout import EvaluateConfig
+    from sart_toolkit.learn.training import TrainConfig
+    from sart_toolkit.scenes.appearance import AppearanceConfig
+
+    stages: dict[str, tuple[Callable[..., Any], type[Any] | None]] = {
+        "record": (record, None),
+        "suggest": (suggest, SuggestConfig),
+        "augment": (augment, AugmentConfig),
+        "train": (train_policy, TrainConfig),
+        "evaluate": (evaluate, EvaluateConfig),
+    }
+    function, config = stages[stage]
+    found = dict(options)
+    if "appearance" in found:
+        found["appearance"] = AppearanceConfig.only(**found["appearance"])
+    if "sampling" in found:
+        found["sampling"] = SamplingConfig(**_known("sampling", found["sampling"], SamplingConfig))
+    own = {*inspect.signature(function).parameters, "count"}
+    rest = {name: value for name, value in found.items() if name not in own}
+    if config is None:
+        _known(stage, rest)
+    elif config is TrainConfig:
+        _train_config(found["policy"], rest)
+    else:
+        config(**_known(stage, rest, config))
+    return found
+
+
+def _known(what: str, values: Mapping[str, Any], config: type[Any] | None = None) -> Any:
+    """The values, all of them fields of a config."""
+    names = [] if config is None else [field.name for field in dataclasses.fields(config)]
+    for name in values:
+        if name not in names:
+            raise unknown_name(f"option of {what}", name, names)
+    return values
+
+
+def _carry_out(
+    stage: str, out: Path, inputs: Mapping[str, Path], options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Carry out a stage of a benchmark's cell in a directory; figures of it.
+
+    A stage that was finished but not noted is not done again.
+    """
+    given = _stage_options(stage, options)
+    demos = sorted(inputs.get("demo", out).glob("demo*.h5"))
+    if stage == "record":
+        count = given.pop("count")
+        if count > 1:
+            record_several(out=out, count=count, **{"placement": "random", **given})
+        elif not (out / "demo.h5").exists():
+            record(out=out / "demo.h5", **given)
+        shown = [load_demonstration(path) for path in sorted(out.glob("demo*.h5"))]
+        spent = [float(d.timestamps[-1] - d.timestamps[0]) for d in shown]
+        return {"demonstrations": len(shown), "demonstrating_seconds": sum(spent)}
+    if stage == "suggest":
+        for demo in demos:
+            path = out / demo.with_suffix(".json").name
+            if not path.exists():
+                suggest(demo, path, **given)
+        spheres = [load_annotation(path) for path in sorted(out.glob("demo*.json"))]
+        return {
+            "spheres": sum(len(annotation.spheres) for annotation in spheres),
+            "annotating_seconds": sum(annotation.seconds for annotation in spheres),
+        }
+    if stage == "augment":
+        annotations = sorted(inputs.get("annotation", out).glob("demo*.json"))
+        path = out / "dataset"
+        if not (path / "dataset.json").exists():
+            augment(demos, annotations, path, **given)
+        info = read_json(path / "dataset.json", DatasetFile)
+        return {
+            "kept": info["n_kept"],
+            "attempted": info["n_attempted"],
+            "rejections": info["rejections"],
+            "simulated_seconds": info.get("simulated_seconds"),
+            "resets": info.get("resets"),
+        }
+    if stage == "train":
+        path = out / "skill"
+        if not (path / "config.json").exists():
+            train_policy(inputs["dataset"] / "dataset", path, **given)
+        training = read_json(path / "training.json", TrainingFile)
+        return {name: training.get(name) for name in ("final_loss", "windows", "trajectories")}
+    path = out / "evaluation.json"
+    if not path.exists():
+        evaluate(inputs["skill"] / "skill", path, final_images=True, **given)
+    figures = read_json(path, EvaluationFile)
+    return {name: figures[name] for name in ("n_success", "n_episodes")}
 
 
 def run_skill(

@@ -32,6 +32,7 @@ _UNITS = {
     "segments": "segment",
     "radii": "task",
     "cloud": "task",
+    "benchmark": "job",
 }
 _PLURALS = {"s": "s", "trajectory": "trajectories"}
 # Where nobody watches a bar, a line is written so often [s].
