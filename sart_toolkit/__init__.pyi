@@ -102,6 +102,13 @@ from .data.combine import (
 )
 from .data.dataset import Dataset as Dataset
 from .data.dataset import load_dataset as load_dataset
+from .data.formats import FORMATS as FORMATS
+from .data.formats import get_format as get_format
+from .data.formats.format import About as About
+from .data.formats.format import Format as Format
+from .data.formats.format import Given as Given
+from .data.formats.format import Reads as Reads
+from .data.formats.format import Trajectory as Trajectory
 from .data.records import (
     Annotation as Annotation,
 )
@@ -191,6 +198,7 @@ from .errors import (
 from .errors import (
     Unreachable as Unreachable,
 )
+from .evaluate.compare import compare_rollouts as compare_rollouts
 from .evaluate.rollout import (
     EvaluateConfig as EvaluateConfig,
 )
@@ -212,7 +220,11 @@ from .learn.skill import load_skill as load_skill
 from .learn.skill import save_skill as save_skill
 from .learn.training import TrainConfig as TrainConfig
 from .learn.training import train as train
+from .pipeline import check_export as check_export
+from .pipeline import export as export
+from .pipeline import import_recordings as import_recordings
 from .pipeline import run as run
+from .pipeline import run_benchmark as run_benchmark
 from .pipeline import run_skill as run_skill
 from .pipeline import train_seeds as train_seeds
 from .poses import inverse as inverse

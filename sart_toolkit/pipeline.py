@@ -23,6 +23,7 @@ import numpy as np
 from sart_toolkit.augment import STRATEGIES
 from sart_toolkit.backends import BACKENDS, get_backend, make_backend
 from sart_toolkit.data.dataset import Dataset, load_dataset
+from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.records import (
     DEFAULT_RATES,
     Annotation,
@@ -32,7 +33,7 @@ from sart_toolkit.data.records import (
     Referring,
     library_versions,
 )
-from sart_toolkit.data.schemas import DatasetFile, EvaluationFile, RunFile
+from sart_toolkit.data.schemas import DatasetFile, EvaluationFile, RunFile, TrainingFile
 from sart_toolkit.data.storage import (
     OutputLock,
     check_writable,
@@ -51,6 +52,7 @@ from sart_toolkit.errors import (
     MissingFile,
     OutputExists,
     UnknownName,
+    unknown_name,
 )
 from sart_toolkit.learn.policies import POLICIES
 from sart_toolkit.record.devices import DEVICES, make_device
@@ -66,8 +68,10 @@ if TYPE_CHECKING:
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
     from sart_toolkit.backends.interface import Backend, BackendFactory
+    from sart_toolkit.benchmark.plans import Plan
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
     from sart_toolkit.collision.world import CollisionWorld
+    from sart_toolkit.data.formats.format import Format, Given
     from sart_toolkit.evaluate.rollout import Film, Rollout
     from sart_toolkit.learn.policy import Policy
     from sart_toolkit.learn.skill import SkillConfig
@@ -80,12 +84,14 @@ if TYPE_CHECKING:
     RobotLike = str | RobotSpec
     TaskLike = str | Task | type[Task]
     BackendLike = str | type[Backend]
+    FormatLike = str | Format | type[Format]
     Steer = Callable[[Path, DeviceSetup, Device, Placement, SessionConfig], Demonstration]
 
 _log = logging.getLogger(__name__)
 _TABLES: Mapping[str, Mapping[str, str]] = {
     "backend": BACKENDS,
     "device": DEVICES,
+    "format": FORMATS,
     "policy": POLICIES,
     "robot": ROBOTS,
     "strategy": STRATEGIES,
@@ -318,6 +324,7 @@ def record(
 
     found = get_task(task)
     spec, scene = get_robot(robot or found.robot), found.scene
+    found.check_operable(yaw_deg)
     rng = np.random.default_rng(seed)
     at = found.sample_placement(rng, yaw_deg) if placement == "random" else Placement()
     references = {
@@ -843,6 +850,152 @@ def split(
     return split_sources(found, out, overwrite, shown)
 
 
+def export(
+    dataset: Path,
+    out: Path,
+    format: FormatLike,
+    *,
+    instruction: str | None = None,
+    depth: bool = True,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """What was written when a dataset, or a demonstration, is exported to a format of the field.
+
+    Args:
+        dataset: directory from `augment`, `merge` or `split`, or a demonstration's file.
+        out: the file or directory to write.
+        format: how; see `data.formats`.
+        instruction: the task in a sentence; the first of the task's docstring if left out, or its
+            name in words where the task can't be found.
+        depth: whether depth images are written.
+        task, robot: in place of those that the recording notes.
+        overwrite: whether an earlier export may be replaced.
+        progress: called with the trajectories done.
+
+    Raises:
+        UnknownName: no such format, or the task or robot that is given can't be found.
+        MissingExtra: the format needs a library that isn't installed.
+        MissingFile, BrokenFile, Mismatch, InvalidInput, OutputExists, CannotWrite: as
+            `export_dataset`.
+    """
+    check_names(format=format, task=task, robot=robot)
+    found = load_dataset(dataset) if Path(dataset).is_dir() else load_demonstration(dataset)
+    from sart_toolkit.data.formats.format import about_dataset
+    from sart_toolkit.data.formats.transfer import export_dataset
+
+    made = get_format(format)
+    first = found if isinstance(found, Demonstration) else found.sources[0].demonstration
+    try:
+        words = (task_of(first, task).__doc__ or "").partition("\n")[0].rstrip(".")
+    except UnknownName:
+        if task is not None:
+            raise
+        words = ""
+    try:
+        joints = robot_of(first, robot).arm_joints
+    except UnknownName:
+        if robot is not None:
+            raise
+        joints = ()
+    about = about_dataset(found, instruction or words, joints, depth)
+    export_dataset(found, made, out, about, overwrite, lambda *counts: progress("export", *counts))
+    return {
+        "format": made.name,
+        "instruction": about.instruction,
+        "trajectories": about.n_trajectories,
+        "bytes": _size(Path(out)),
+    }
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of all files in a directory."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def import_recordings(
+    path: Path,
+    out: Path,
+    format: FormatLike | None = None,
+    *,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    gripper_range: tuple[float, float] | None = None,
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> list[Path]:
+    """The demonstrations' files that are made of recordings in a format of the field.
+
+    Args:
+        path: a recording, or a directory of several.
+        out: the HDF5 file to write; for a directory, the directory of as many.
+        format: what it is; found out if left out.
+        task, robot: what it is of, where the file doesn't say so.
+        gripper_range: what the file has for an open and for a closed gripper, where it doesn't say.
+        overwrite: whether earlier files may be replaced.
+        progress: called with the recordings done.
+
+    Raises:
+        UnknownName: the format, the task or the robot can't be found.
+        MissingFile, BrokenFile: it can't be read, or is of no format that is read.
+        InvalidInput: the format isn't read, or something is said neither by the file nor here.
+        OutputExists, CannotWrite: as `check_writable` and `save_demonstration`.
+    """
+    check_names(format=format, task=task, robot=robot)
+    path, out = Path(path), Path(out)
+    if not path.exists():
+        raise MissingFile(f"{path}: no such file or directory; check the path")
+    check_writable(out, overwrite)
+    from sart_toolkit.data.formats.format import reader_of
+
+    reader, found = reader_of(path, None if format is None else get_format(format))
+    given = _given(task, robot, gripper_range)
+    single = found == [path]
+    paths = [out] if single else [demonstration_path(out, i) for i in range(len(found))]
+    for i, (recording, target) in enumerate(zip(found, paths, strict=True)):
+        with OutputLock(target):
+            save_demonstration(target, reader.read(recording, given))
+        progress("import", i + 1, len(found))
+    return paths
+
+
+def _given(
+    task: TaskLike | None, robot: RobotLike | None, gripper_range: tuple[float, float] | None
+) -> Given:
+    """What a person says of a recording, with the kinematics of the robot."""
+    from sart_toolkit.data.formats.format import Given
+
+    said: dict[str, Any] = {"gripper_range": gripper_range}
+    given = {"task": task, "robot": robot}
+    found = {k: reference_to(k, v, _TABLES[k]) for k, v in given.items() if v is not None}
+    references = {kind: reference for kind, reference in found.items() if reference is not None}
+    if task is not None:
+        said["task"] = get_task(task).name
+    if robot is not None:
+        from sart_toolkit.robots.model import RobotModel
+
+        model = RobotModel(get_robot(robot))
+        said |= {"robot": model.spec.name, "fk": model.fk, "cameras": model.mounted_cameras()}
+    return Given(references=references, **said)
+
+
+def check_export(path: Path, format: FormatLike) -> Sequence[str]:
+    """What a reader of a format would fail on in what is said to be of it; empty if all is well.
+
+    Raises:
+        UnknownName: no such format.
+        MissingFile: there is nothing.
+        MissingExtra: the format needs a library that isn't installed.
+    """
+    check_names(format=format)
+    if not Path(path).exists():
+        raise MissingFile(f"{path}: no such file or directory; check the path")
+    return get_format(format).problems(path)
+
+
 @_alone
 def train_policy(
     dataset: Path,
@@ -1179,6 +1332,7 @@ def run(
         ("evaluate", evaluation, lambda: evaluate(
             skill, evaluation, task=task, robot=robot, backend=backend, workers=workers,
             device=device, progress=progress, episodes=episodes, eval_seed=eval_seed, videos=2,
+            final_images=True,
         )),
     ]  # fmt: skip
     for name, result, carry_out in steps:
@@ -1233,6 +1387,163 @@ def _resumed(out: Path, wanted: Mapping[str, Any], overwrite: bool) -> dict[str,
     else:
         check_writable(out)
     return {"config": wanted, "stages": {}}
+
+
+def run_benchmark(
+    plan: str | Path | Plan,
+    out: Path | str,
+    *,
+    changes: Mapping[str, Any] | None = None,
+    only: str | None = None,
+    store: Path | None = None,
+    workers: int | Workers = 1,
+    command: str = "sart_toolkit.run_benchmark",
+    dry_run: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """The result of a benchmark's plan in directory `out`: see `benchmark.runner.run_plan`.
+
+    Args:
+        plan: a name in `benchmark.plans.PLANS`, a TOML file, or the plan itself.
+        out: directory to write; an interrupted benchmark resumes.
+        changes: of a name or file, values of cells' fields in place of those in it.
+        only: a pattern of the names of cells; all if left out.
+        store: directory of the stages' results, which plans may share; `out`/stages if left out.
+        workers: how many processes, or `Workers` elsewhere.
+        command: how it was asked for, kept with the result.
+        dry_run: only say what is missing and what it would take: see `preview_plan`.
+        progress: called with the jobs done of each stage.
+
+    Raises:
+        UnknownName: no such plan, cell or field, or a reference of a cell leads to nothing.
+        MissingFile, BrokenFile: the plan's file can't be read.
+        InvalidInput: a value in it is not acceptable.
+        CannotWrite, SartError: as `run_plan`.
+    """
+    from sart_toolkit.benchmark.plans import Plan, read_plan
+
+    found = plan if isinstance(plan, Plan) else read_plan(plan, changes)
+    if changes and found is plan:
+        raise InvalidInput("changes: are for a plan's name or file; change the plan itself")
+    found = found if only is None else found.only(only)
+    for cell in found.cells:
+        check_names(
+            task=cell.task, backend=cell.backend, strategy=cell.strategy, policy=cell.policy
+        )
+        check_names(backend=cell.evaluate_on)
+    from sart_toolkit.benchmark.jobs import jobs_of
+    from sart_toolkit.benchmark.runner import preview_plan, run_plan
+
+    # What can't work should be said before hours are spent.
+    for cell in found.cells:
+        for stage, job in jobs_of(cell).items():
+            _stage_options(stage, job.options)
+    if dry_run:
+        return preview_plan(found, Path(out), workers, store)
+    return run_plan(
+        found, Path(out), _carry_out, workers, store,
+        {"command": command, "machine": machine()}, progress,
+    )  # fmt: skip
+
+
+def _stage_options(stage: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON values of a benchmark's stage as the options of the function that carries it out.
+
+    Raises:
+        UnknownName, InvalidInput: one is not acceptable.
+    """
+    from sart_toolkit.annotate.suggest import SuggestConfig
+    from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.data.sampling import SamplingConfig
+    from sart_toolkit.evaluate.rollout import EvaluateConfig
+    from sart_toolkit.learn.training import TrainConfig
+    from sart_toolkit.scenes.appearance import AppearanceConfig
+
+    stages: dict[str, tuple[Callable[..., Any], type[Any] | None]] = {
+        "record": (record, None),
+        "suggest": (suggest, SuggestConfig),
+        "augment": (augment, AugmentConfig),
+        "train": (train_policy, TrainConfig),
+        "evaluate": (evaluate, EvaluateConfig),
+    }
+    function, config = stages[stage]
+    found = dict(options)
+    if "appearance" in found:
+        found["appearance"] = AppearanceConfig.only(**found["appearance"])
+    if "sampling" in found:
+        found["sampling"] = SamplingConfig(**_known("sampling", found["sampling"], SamplingConfig))
+    own = {*inspect.signature(function).parameters, "count"}
+    rest = {name: value for name, value in found.items() if name not in own}
+    if config is None:
+        _known(stage, rest)
+    elif config is TrainConfig:
+        _train_config(found["policy"], rest)
+    else:
+        config(**_known(stage, rest, config))
+    return found
+
+
+def _known(what: str, values: Mapping[str, Any], config: type[Any] | None = None) -> Any:
+    """The values, all of them fields of a config."""
+    names = [] if config is None else [field.name for field in dataclasses.fields(config)]
+    for name in values:
+        if name not in names:
+            raise unknown_name(f"option of {what}", name, names)
+    return values
+
+
+def _carry_out(
+    stage: str, out: Path, inputs: Mapping[str, Path], options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Carry out a stage of a benchmark's cell in a directory; figures of it.
+
+    A stage that was finished but not noted is not done again.
+    """
+    given = _stage_options(stage, options)
+    demos = sorted(inputs.get("demo", out).glob("demo*.h5"))
+    if stage == "record":
+        count = given.pop("count")
+        if count > 1:
+            record_several(out=out, count=count, **{"placement": "random", **given})
+        elif not (out / "demo.h5").exists():
+            record(out=out / "demo.h5", **given)
+        shown = [load_demonstration(path) for path in sorted(out.glob("demo*.h5"))]
+        spent = [float(d.timestamps[-1] - d.timestamps[0]) for d in shown]
+        return {"demonstrations": len(shown), "demonstrating_seconds": sum(spent)}
+    if stage == "suggest":
+        for demo in demos:
+            path = out / demo.with_suffix(".json").name
+            if not path.exists():
+                suggest(demo, path, **given)
+        spheres = [load_annotation(path) for path in sorted(out.glob("demo*.json"))]
+        return {
+            "spheres": sum(len(annotation.spheres) for annotation in spheres),
+            "annotating_seconds": sum(annotation.seconds for annotation in spheres),
+        }
+    if stage == "augment":
+        annotations = sorted(inputs.get("annotation", out).glob("demo*.json"))
+        path = out / "dataset"
+        if not (path / "dataset.json").exists():
+            augment(demos, annotations, path, **given)
+        info = read_json(path / "dataset.json", DatasetFile)
+        return {
+            "kept": info["n_kept"],
+            "attempted": info["n_attempted"],
+            "rejections": info["rejections"],
+            "simulated_seconds": info.get("simulated_seconds"),
+            "resets": info.get("resets"),
+        }
+    if stage == "train":
+        path = out / "skill"
+        if not (path / "config.json").exists():
+            train_policy(inputs["dataset"] / "dataset", path, **given)
+        training = read_json(path / "training.json", TrainingFile)
+        return {name: training.get(name) for name in ("final_loss", "windows", "trajectories")}
+    path = out / "evaluation.json"
+    if not path.exists():
+        evaluate(inputs["skill"] / "skill", path, final_images=True, **given)
+    figures = read_json(path, EvaluationFile)
+    return {name: figures[name] for name in ("n_success", "n_episodes")}
 
 
 def run_skill(

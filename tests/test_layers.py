@@ -29,6 +29,7 @@ LAYERS = (
     "augment",
     "learn",
     "evaluate",
+    "gym",
     "report",
     "benchmark",
     "testing",

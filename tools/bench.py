@@ -46,6 +46,8 @@ from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
 from sart_toolkit.data import storage
 from sart_toolkit.data.dataset import Dataset
+from sart_toolkit.data.formats import FORMATS, get_format
+from sart_toolkit.data.formats.format import trajectories_of
 from sart_toolkit.data.records import (
     Annotation,
     CameraRecord,
@@ -505,6 +507,71 @@ def _measured(work: str, *arguments: Any) -> dict[str, Any]:
         raise SartError(f"a measured program failed: {run.stderr.strip().splitlines()[-1]}")
     found: dict[str, Any] = json.loads(run.stdout.splitlines()[-1])
     return found
+
+
+# --- formats ------------------------------------------------------------------------------------
+
+_EXPORT = """
+from pathlib import Path
+from sart_toolkit.data.dataset import load_dataset
+from sart_toolkit.data.formats import get_format
+from sart_toolkit.data.formats.format import about_dataset, trajectories_of
+from sart_toolkit.data.formats.transfer import export_dataset
+dataset = load_dataset(Path(sys.argv[1]))
+about = about_dataset(dataset)
+begin()
+if sys.argv[2] == "raw":
+    with open(sys.argv[3], "wb") as file:
+        for trajectory in trajectories_of(dataset):
+            for camera in trajectory.steps.cameras.values():
+                file.write(camera.rgb.data)
+                file.write(camera.depth.data)
+else:
+    export_dataset(dataset, get_format(sys.argv[2]), Path(sys.argv[3]), about)
+result = {}
+"""
+
+
+def bench_formats(arguments: Sequence[str]) -> dict[str, Any]:
+    """Bytes and time a frame of each export format, against raw images, and peak memory by size.
+
+    Every export is a program of its own: it reads the dataset, joins trajectories and writes them
+    whole. `raw`: the same with images and depth written to a file as they are. Memory is measured
+    with the first of `--n` and with the last, which should make no difference.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py formats", description=bench_formats.__doc__)
+    parser.add_argument("--task", default="peg_in_hole", help=", ".join(TASKS))
+    parser.add_argument("--image-size", type=int, default=128, help="[pixels]")
+    parser.add_argument("--n", type=int, nargs="+", default=[10, 100], help="trajectories")
+    options = parser.parse_args(arguments)
+    figures: dict[str, Any] = {}
+    demonstration, annotation, make = augmentation(options.task, options.image_size)
+    with tempfile.TemporaryDirectory() as scratch:
+        for n in options.n:
+            path = Path(scratch) / str(n)
+            config = AugmentConfig(n)
+            dataset = augment_demonstration(demonstration, annotation, make, path, config)
+            frames = sum(map(len, trajectories_of(dataset)))
+            rows: dict[str, Any] = {"ours": {"bytes_per_frame": _bytes_in(path) / frames}}
+            for name in ("raw", *FORMATS):
+                suffix = "" if name == "raw" else get_format(name).suffix
+                out = Path(scratch) / f"{n}_{name}{suffix}"
+                found = _measured(_EXPORT, path, name, out)
+                rows[name] = {
+                    "bytes_per_frame": _bytes_in(out) / frames,
+                    "frames_per_second": frames / found["seconds"],
+                    "frames_per_processor_second": frames / found["processor_seconds"],
+                    "peak_mb": found["peak_mb"],
+                }
+                _say(f"{name}, {n} trajectories: {rows[name]['bytes_per_frame']:.0f} bytes a frame")
+            figures[str(n)] = {"frames": frames, **rows}
+    return {"task": options.task, "image_size": options.image_size, "trajectories": figures}
+
+
+def _bytes_in(path: Path) -> int:
+    """Bytes of a file, or of all files in a directory."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 # --- augmentation -------------------------------------------------------------------------------
@@ -1286,6 +1353,7 @@ BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "certificate": bench_certificate,
     "dataset": bench_dataset,
     "draw": bench_draw,
+    "formats": bench_formats,
     "plan": bench_plan,
     "step": bench_step,
     "storage": bench_storage,

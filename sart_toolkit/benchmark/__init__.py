@@ -1,1 +1,1 @@
-"""Measurements of the toolkit itself, over tasks and backends."""
+"""Plans of skills to learn and evaluate, and measurements of the toolkit itself."""

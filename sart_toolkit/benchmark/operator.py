@@ -100,7 +100,7 @@ def benchmark_operator(
         CannotWrite: the disk refuses.
     """
     for cell in cells:
-        cell.task.sample_placement(np.random.default_rng(config.seed), config.yaw_deg)
+        cell.task.check_operable(config.yaw_deg)
     with ResultLog(out, {"seed": config.seed, "yaw_deg": config.yaw_deg}, overwrite) as log:
         rows = {(row["cell"], row["episode"]): row for row in log.rows}
         wanted = [(cell.name, i) for cell in cells for i in range(config.episodes)]

@@ -96,9 +96,6 @@ def _run(words: list[str]) -> None:
     if not words or words[0] in _HELP:
         print(overview())
         sys.exit(0 if words else 2)
-    if words[0] in ("benchmark", "new") and words[1:2] and words[1] in _HELP:
-        print(overview(words[0]))
-        sys.exit(0)
     name, rest = find_verb(words)
     args = VERBS[name].parse(name, rest)
     show(VERBS[name](args), args.json)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sart_toolkit.augment import STRATEGIES
+from sart_toolkit.data.formats import FORMATS
 from sart_toolkit.errors import InvalidInput
 
 
@@ -476,13 +477,28 @@ class Validate:
 
     Example: sart validate dataset --replay
 
+    Example: sart validate peg_lerobot --format lerobot
+
     With --replay every trajectory is executed to the end of the task besides, commanded at the rate
     of a policy, and DATASET/replay.json says which reach the goal. That resumes when interrupted.
+
+    With --format, what is checked is a dataset in a format of the field, anyone's: that it holds
+    what readers of the format rely on, which often fail on it only when they come to the place.
     """
 
     dataset: Annotated[
-        Positional[Path], arg(metavar="DATASET", help="Directory from `sart augment`.")
+        Positional[Path],
+        arg(
+            metavar="DATASET",
+            help="Directory from `sart augment`; with --format, a path of that format.",
+        ),
     ]
+    format: Annotated[
+        str | None,
+        _optional(
+            "REF", f"Format of DATASET: {', '.join(FORMATS)}, or your own; ours if left out."
+        ),
+    ] = None
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
     backend: _NOTED_BACKEND = None
@@ -549,6 +565,86 @@ class Split:
     ] = None
     by_source: Annotated[bool, arg(help="A part for each demonstration.")] = False
     seed: Annotated[int, arg(help="Seed of which episodes the --parts get.")] = 0
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a dataset in a format of the field, for others' policies and tools.
+
+    Example: sart export dataset --format lerobot --out peg_lerobot
+
+    Example: sart export dataset --format robomimic --out peg.hdf5
+
+    Example: sart export dataset --format zarr --out peg.zarr --no-depth
+
+    Example: sart export demo.h5 --format rmb --out recordings
+
+    Every trajectory is written whole: a generated segment, then its demonstration from where it
+    rejoins. lerobot, rmb, rmb_hdf5 and zarr are
+    directories, robomimic is a file.
+    """
+
+    dataset: Annotated[
+        Positional[Path],
+        arg(
+            metavar="DATASET",
+            help="Directory from `sart augment`, `merge` or `split`, or a demonstration.",
+        ),
+    ]
+    out: Annotated[Path, arg(help="File or directory to write.")]
+    format: Annotated[str, arg(metavar="REF", help=f"Format: {', '.join(FORMATS)}, or your own.")]
+    instruction: Annotated[
+        str | None,
+        _optional(
+            "TEXT", "The task in a sentence, as policies are told it; the task's own if left out."
+        ),
+    ] = None
+    depth: Annotated[bool, arg(help="Leave depth images out.")] = True
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Import:
+    """Make demonstrations of recordings in a format of the field: RMB, both variants.
+
+    Example: sart import peg_in_hole_0000.rmb --out demo.h5
+
+    Example: sart import recordings --out demos
+
+    Example: sart import cable.rmb --out demo.h5 --task cable.py:Cable --robot my_ur5e.py:UR5E
+        --gripper-range 0,255
+
+    What a file doesn't say has to be said: of a recording from elsewhere the task, the robot (its
+    tool frame, and where its cameras are mounted), and the range of its gripper.
+    """
+
+    file: Annotated[
+        Positional[Path],
+        arg(metavar="FILE", help="A recording, .rmb or .hdf5, or a directory of several."),
+    ]
+    out: Annotated[Path, arg(help="HDF5 file to write; of several, the directory of as many.")]
+    format: Annotated[
+        str | None, _optional("REF", "Format, as for export; found out if left out.")
+    ] = None
+    task: Annotated[
+        str | None, _optional("REF", f"Task, as {_REF}, where the file doesn't say it.")
+    ] = None
+    robot: Annotated[
+        str | None, _optional("REF", f"Robot, as {_REF}, where the file doesn't say it.")
+    ] = None
+    gripper_range: Annotated[
+        str | None,
+        _optional(
+            "OPEN,CLOSED",
+            "What the file has for an open and for a closed gripper, such as 0,255, where it "
+            "doesn't say it.",
+        ),
+    ] = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
 
@@ -636,6 +732,8 @@ class Evaluate:
 
     Example: sart evaluate skill --out varied.json --vary-appearance --yaw-deg 15
 
+    Example: sart evaluate skill --out camera.json --appearance camera=0.005,camera_deg=2
+
     Interrupted, it resumes when the same command is typed again.
     """
 
@@ -647,7 +745,25 @@ class Evaluate:
     episodes: _EPISODES = 50
     eval_seed: _EVAL_SEED = 1000
     yaw_deg: _YAW = 0.0
+    placement_range: Annotated[
+        float | None,
+        _optional(
+            "METRES", "Half width of the square of placements [m]; the task's own if left out."
+        ),
+    ] = None
     vary_appearance: _APPEARANCE = False
+    appearance: Annotated[
+        str | None,
+        _optional(
+            "NAME=NUMBER,...",
+            "Vary only these: colour, light, ambient (shares), light_deg, camera [m], camera_deg, "
+            "camera_offset [m] (moved just so far), distractors (how many); nothing if left out.",
+        ),
+    ] = None
+    latency: Annotated[float, arg(help="So late the policy sees what it acts on [s].")] = 0.0
+    final_images: Annotated[
+        bool, arg(help="Keep what the cameras saw at the end of each failure, beside OUT.")
+    ] = False
     videos: Annotated[int, arg(help="Videos of the first successes, and as many of failures.")] = 2
     workers: _WORKERS = 2
     executor: _EXECUTOR = "processes"
@@ -813,6 +929,88 @@ class BenchmarkSkill:
     executor: _EXECUTOR = "processes"
     ray_address: _RAY_ADDRESS = None
     device: _DEVICE = "auto"
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Learn and evaluate every cell of a plan, a grid of skills, and show tables with intervals.
+
+    Plans: table1, scaling, ablation, miles_radii, effort, transfer, placement, robustness,
+    precision; or a TOML file of your own, as docs/benchmarks.md has it. Measurements of the toolkit
+    itself, operator, replay, segments, radii, cloud and skill, have flags of their own.
+
+    Example: sart benchmark table1 --out runs/table1 --dry-run
+
+    Example: sart benchmark table1 --out runs/table1 --workers 2
+
+    Example: sart benchmark scaling --out runs/scaling --store runs/stages
+        --set task=peg_in_hole n=20,40 demonstration_seed=101,102
+
+    Example: sart benchmark my_plan.toml --out runs/mine --only "peg_in_hole-*-d101-*"
+
+    Example: sart benchmark radii --help
+
+    OUT gets benchmark.html, benchmark.json and a file of each cell in cells/. Interrupted, it
+    resumes when the same command is typed again.
+    """
+
+    plan: Annotated[
+        Positional[str], arg(metavar="PLAN", help="Name of a plan, or a TOML file with one.")
+    ]
+    out: Annotated[Path, arg(help="Directory to write.")]
+    set: Annotated[
+        tuple[str, ...],
+        arg(
+            metavar="FIELD=VALUE[,VALUE...] [...]",
+            help="Other values of cells' fields than the plan has: task, backend, strategy, n, "
+            "policy, demonstration_seed, training_seed, episodes, eval_seed and so on; the plan's "
+            "if left out.",
+            help_behavior_hint="",
+        ),
+    ] = ()
+    only: Annotated[
+        str | None,
+        _optional(
+            "PATTERN", "Only cells whose name matches, such as 'peg*-d101-*'; all if left out."
+        ),
+    ] = None
+    store: Annotated[
+        Path | None,
+        _optional(
+            "PATH",
+            "Directory of the stages' results, which plans may share; OUT/stages if left out.",
+        ),
+    ] = None
+    dry_run: Annotated[
+        bool, arg(help="Only say which cells there are, what is done, and time and disk needed.")
+    ] = False
+    workers: _WORKERS = 2
+    executor: _EXECUTOR = "processes"
+    ray_address: _RAY_ADDRESS = None
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Whether two evaluations differ: by pairs of rollouts where placements are the same.
+
+    Example: sart compare runs/peg runs/peg_bc
+
+    Example: sart compare first.json second.json
+
+    Example: sart compare runs/table1/cells/peg_in_hole-pybullet-sart-n40-d101-t0.json
+        runs/table1/cells/peg_in_hole-pybullet-bc-n40-d101-t0.json
+    """
+
+    a: Annotated[
+        Positional[Path],
+        arg(
+            metavar="A",
+            help="evaluation.json, a cell of a benchmark, or the directory of a run or its skill.",
+        ),
+    ]
+    b: Annotated[Positional[Path], arg(metavar="B", help="What it is compared with.")]
     json: _JSON = False
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Augment, Validate
 from sart_toolkit.cli.console import ProgressDisplay, say
+from sart_toolkit.cli.formats import check_verb
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
 from sart_toolkit.cli.workers import chosen_workers
@@ -69,6 +70,8 @@ def _ask(text: str) -> None:
 
 def validate_verb(args: Validate) -> dict[str, Any]:
     """`sart validate`."""
+    if args.format is not None:
+        return check_verb(args, args.format)
     if not args.replay:
         for flag, given in (
             ("backend", args.backend is not None),

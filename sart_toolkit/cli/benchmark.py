@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from sart_toolkit import pipeline
 from sart_toolkit.backends import BACKENDS, get_backend, make_backend
 from sart_toolkit.cli.arguments import (
+    Benchmark,
     BenchmarkCloud,
     BenchmarkOperator,
     BenchmarkRadii,
@@ -23,7 +24,7 @@ from sart_toolkit.data.records import library_versions
 from sart_toolkit.data.schemas import EvaluationFile
 from sart_toolkit.data.storage import OutputLock, check_writable, read_json, write_json
 from sart_toolkit.doctor import machine
-from sart_toolkit.errors import InvalidInput
+from sart_toolkit.errors import InvalidInput, SartError
 from sart_toolkit.robots import get_robot
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.workers import Workers
@@ -55,6 +56,77 @@ def _cells(tasks: str, backends: str) -> list[Cell]:
         make = functools.partial(make_backend, backend, get_robot(task.robot), task.scene, 128)
         cells.append(Cell(task, backend.name, make))
     return cells
+
+
+def plan_verb(args: Benchmark) -> Result:
+    """`sart benchmark PLAN`.
+
+    Raises:
+        SartError: a cell failed; the others are done.
+    """
+    with ProgressDisplay() as progress:
+        result = pipeline.run_benchmark(
+            args.plan,
+            args.out,
+            changes=_changes(args.set),
+            only=args.only,
+            store=args.store,
+            workers=chosen_workers(args),
+            command=typed(),
+            dry_run=args.dry_run,
+            progress=progress,
+        )
+    if args.dry_run:
+        return _needed(result)
+    if result["failed"]:
+        name, reason = next(iter(result["failed"].items()))
+        raise SartError(
+            f"{len(result['failed'])} of {len(result['failed']) + len(result['cells'])} cells "
+            f"failed, the first {name}: {reason}; the others are in {args.out / 'benchmark.html'}"
+        )
+    lines = {
+        " ".join([entry["row"], entry["column"], *table["given"].values()]): _rate(entry["rate"])
+        for table in result["tables"]
+        for entry in table["entries"]
+        if "rate" in entry
+    }
+    return {"page": str(args.out / "benchmark.html"), "cells": len(result["cells"]), **lines}
+
+
+def _changes(words: tuple[str, ...]) -> dict[str, Any]:
+    """Values of fields by name, each a list where there are several."""
+    changes: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals:
+            raise InvalidInput(f"--set: expected FIELD=VALUE, got {word!r}")
+        values = [int(v) if v.lstrip("-").isdecimal() else v for v in text.split(",")]
+        changes[name] = values if len(values) > 1 else values[0]
+    return changes
+
+
+def _needed(preview: Result) -> Result:
+    """What a dry run says."""
+    measured = ", ".join(preview["measured"]) or "none"
+    cells = {
+        name: f"missing {', '.join(cell['missing'])}: {_time(cell['seconds'])}"
+        if cell["missing"]
+        else "done"
+        for name, cell in preview["cells"].items()
+    }
+    done = sum(not cell["missing"] for cell in preview["cells"].values())
+    return {
+        **cells,
+        "cells": f"{len(cells)}, {done} of them done",
+        "jobs": f"{preview['jobs']} missing, each counted once",
+        "time": f"about {_time(preview['seconds'])} (stages measured here: {measured})",
+        "disk": f"about {preview['bytes'] / 1e6:.0f} MB more",
+    }
+
+
+def _time(seconds: float) -> str:
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
 
 
 def operator_verb(args: BenchmarkOperator) -> Result:

@@ -21,6 +21,8 @@ _UNITS = {
     "merge": "episode",
     "split": "episode",
     "validate": "episode",
+    "export": "trajectory",
+    "import": "recording",
     "read": "trajectory",
     "train": "step",
     "sweep": "training",
@@ -30,6 +32,7 @@ _UNITS = {
     "segments": "segment",
     "radii": "task",
     "cloud": "task",
+    "benchmark": "job",
 }
 _PLURALS = {"s": "s", "trajectory": "trajectories"}
 # Where nobody watches a bar, a line is written so often [s].

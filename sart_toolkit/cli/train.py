@@ -10,6 +10,7 @@ from sart_toolkit.cli.console import ProgressDisplay
 from sart_toolkit.cli.info import describe_skill, without_rows
 from sart_toolkit.cli.workers import chosen_workers
 from sart_toolkit.errors import InvalidInput
+from sart_toolkit.scenes.appearance import AppearanceConfig
 from sart_toolkit.workers import Workers
 
 
@@ -67,6 +68,29 @@ def _sweep(args: Train, workers: Workers, options: dict[str, Any]) -> dict[str, 
     }
 
 
+def _appearance(args: Evaluate) -> AppearanceConfig | None:
+    """How far the appearance varies, by flags.
+
+    Raises:
+        InvalidInput: both flags are given, or the one can't be read.
+        UnknownName: there is no such part of the appearance.
+    """
+    if args.appearance is None:
+        return AppearanceConfig() if args.vary_appearance else None
+    if args.vary_appearance:
+        raise InvalidInput("--vary-appearance: varies everything; leave it out, or --appearance")
+    values = {}
+    for word in args.appearance.split(","):
+        name, _, amount = word.partition("=")
+        try:
+            values[name] = float(amount)
+        except ValueError as error:
+            raise InvalidInput(
+                f"--appearance: expected NAME=NUMBER,..., got {args.appearance!r}"
+            ) from error
+    return AppearanceConfig.only(**values)
+
+
 def evaluate_verb(args: Evaluate) -> dict[str, Any]:
     """`sart evaluate`."""
     with ProgressDisplay() as progress:
@@ -76,8 +100,11 @@ def evaluate_verb(args: Evaluate) -> dict[str, Any]:
             episodes=args.episodes,
             eval_seed=args.eval_seed,
             videos=args.videos,
+            final_images=args.final_images,
             yaw_deg=args.yaw_deg,
-            vary_appearance=args.vary_appearance,
+            placement_range=args.placement_range,
+            appearance=_appearance(args),
+            latency=args.latency,
             task=args.task,
             robot=args.robot,
             backend=args.backend,

@@ -12,6 +12,7 @@ from typing import Any
 
 import tyro
 
+from sart_toolkit.benchmark.plans import PLANS
 from sart_toolkit.cli import arguments
 from sart_toolkit.errors import InvalidInput, unknown_name
 
@@ -53,9 +54,13 @@ VERBS: Mapping[str, Verb] = {
     "validate": Verb(arguments.Validate, "sart_toolkit.cli.augment:validate_verb"),
     "merge": Verb(arguments.Merge, "sart_toolkit.cli.combine:merge_verb"),
     "split": Verb(arguments.Split, "sart_toolkit.cli.combine:split_verb"),
+    "export": Verb(arguments.Export, "sart_toolkit.cli.formats:export_verb"),
+    "import": Verb(arguments.Import, "sart_toolkit.cli.formats:import_verb"),
     "train": Verb(arguments.Train, "sart_toolkit.cli.train:train_verb"),
     "evaluate": Verb(arguments.Evaluate, "sart_toolkit.cli.train:evaluate_verb"),
+    "compare": Verb(arguments.Compare, "sart_toolkit.cli.compare:compare_verb"),
     "report": Verb(arguments.Report, "sart_toolkit.cli.run:report_verb"),
+    "benchmark": Verb(arguments.Benchmark, "sart_toolkit.cli.benchmark:plan_verb"),
     "benchmark operator": Verb(
         arguments.BenchmarkOperator, "sart_toolkit.cli.benchmark:operator_verb"
     ),
@@ -79,30 +84,36 @@ def find_verb(words: list[str]) -> tuple[str, list[str]]:
     """The name of the verb that a command begins with, and the words after it.
 
     Raises:
-        UnknownName: there is no such verb; the message offers the nearest.
+        UnknownName: there is no such verb or benchmark; the message offers the nearest.
         InvalidInput: it isn't said of what.
     """
     first = {name.partition(" ")[0] for name in VERBS}
     if words[0] not in first:
         raise unknown_name("verb", words[0], first)
-    if words[0] in VERBS:
-        return words[0], words[1:]
     second = [name.split()[1] for name in VERBS if name.startswith(f"{words[0]} ")]
-    if not words[1:]:
-        raise InvalidInput(f"{words[0]}: of what? add {', '.join(second)}")
-    if words[1] not in second:
+    if not second:
+        return words[0], words[1:]
+    # Of these only `benchmark` is a verb by itself, too.
+    plans = PLANS if words[0] in VERBS else ()
+    if not words[1:] or (words[0] not in VERBS and words[1] in ("--help", "-h")):
+        raise InvalidInput(f"{words[0]}: of what? add {', '.join([*second, *plans])}")
+    if words[1] in second:
+        return f"{words[0]} {words[1]}", words[2:]
+    if not plans:
         raise unknown_name(words[0], words[1], second)
-    return f"{words[0]} {words[1]}", words[2:]
+    # A plan may be named after flags, too.
+    if not words[1].startswith("-") and words[1] not in PLANS and not words[1].endswith(".toml"):
+        raise unknown_name(words[0], words[1], [*PLANS, *second])
+    return words[0], words[1:]
 
 
-def overview(of: str = "") -> str:
-    """What `sart --help` says: each verb with a line; of those that begin with `of`."""
-    chosen = {name: verb for name, verb in VERBS.items() if name.startswith(of)}
-    width = max(map(len, chosen))
-    lines = [f"  {name:<{width}}  {verb.summary}" for name, verb in chosen.items()]
+def overview() -> str:
+    """What `sart --help` says: each verb with a line."""
+    width = max(map(len, VERBS))
+    lines = [f"  {name:<{width}}  {verb.summary}" for name, verb in VERBS.items()]
     return "\n".join(
         [
-            f"usage: sart {of or 'VERB'} ...",
+            "usage: sart VERB ...",
             "",
             "Teach a robot a skill from one demonstration.",
             "",

@@ -157,6 +157,14 @@ class SkillFile(msgspec.Struct):
     cameras: Values | UnsetType = UNSET
 
 
+class Reached(msgspec.Struct, forbid_unknown_fields=True):
+    """The furthest waypoint that a rollout reached, of how many, and when."""
+
+    waypoint: Count
+    of: Count
+    seconds: Seconds
+
+
 class EvaluatedEpisode(msgspec.Struct):
     """A rollout of `evaluation.json`."""
 
@@ -167,6 +175,8 @@ class EvaluatedEpisode(msgspec.Struct):
     success_any: bool = False
     steps: Count | str = ""
     reason: str | None = None
+    progress: Reached | None = None
+    final_image: PathInside | None = None
 
 
 class Video(msgspec.Struct):
@@ -208,6 +218,30 @@ class RunFile(msgspec.Struct):
     command: str = ""
     versions: dict[str, str] = {}
     machine: Values = {}
+
+
+class JobFile(msgspec.Struct, forbid_unknown_fields=True):
+    """`job.json` of a benchmark's stage that is done."""
+
+    stage: Literal["record", "suggest", "augment", "train", "evaluate"]
+    options: Values
+    size: Annotated[int, Meta(ge=1, le=2**53)]
+    seconds: Seconds
+    bytes: Count
+    figures: Values
+
+
+class CellFile(msgspec.Struct):
+    """A cell of a benchmark; besides, whatever was kept with it."""
+
+    name: Name
+    cell: Values
+    keys: dict[str, str]
+    seconds: dict[str, Seconds]
+    figures: dict[str, Values]
+    # None where only effort was asked for.
+    evaluation: EvaluationFile | None
+    command: str = ""
 
 
 class StateHead(msgspec.Struct):

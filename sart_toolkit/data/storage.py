@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import glob
 import hashlib
 import io
 import json
@@ -126,6 +127,66 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(temporary, real)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing_directory(path: Path, mark: str, overwrite: bool = False) -> Iterator[Path]:
+    """An empty directory beside `path` that becomes `path` when the block ends without an error.
+
+    What a process that was killed has left of an earlier one is removed.
+
+    Args:
+        path: the directory; no other process can write it meanwhile.
+        mark: the file that such a directory holds; one without it is never replaced.
+        overwrite: whether such a directory may be replaced.
+
+    Raises:
+        OutputExists: it is there and may not be replaced.
+        CannotWrite: the disk refuses, or another process is at work on it; `path` is as it was.
+    """
+    path = Path(path)
+    with OutputLock(path):
+        check_replaceable(path, mark, overwrite)
+        with _cannot_write(path):
+            real = linked(path)
+            remove_left(real.parent, f".{real.name}.", "")
+            temporary = Path(tempfile.mkdtemp(dir=real.parent, prefix=f".{real.name}."))
+            try:
+                yield temporary
+                for inside in temporary.rglob("*"):
+                    if inside.is_file():
+                        with open(inside, "rb+") as file:
+                            os.fsync(file.fileno())
+                umask = os.umask(0)
+                os.umask(umask)
+                os.chmod(temporary, 0o777 & ~umask)
+                if real.exists():
+                    # Out of the way first: removing it takes time, renaming none.
+                    old = Path(tempfile.mkdtemp(dir=real.parent, prefix=f".{real.name}."))
+                    os.replace(real, old)
+                    os.replace(temporary, real)
+                    shutil.rmtree(old)
+                else:
+                    os.replace(temporary, real)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove_left(directory: Path, prefix: str, suffix: str) -> None:
+    """Remove what a process that was killed has left of writing something large.
+
+    Only who holds the lock of that output can know that nobody is writing it any more.
+
+    Args:
+        directory: where it is.
+        prefix, suffix: what stands before and after the characters drawn at random.
+
+    Raises:
+        CannotWrite: the disk refuses.
+    """
+    for left in directory.glob(f"{glob.escape(prefix)}*{glob.escape(suffix)}"):
+        if re.fullmatch(r"[a-z0-9_]{8}", left.name[len(prefix) : len(left.name) - len(suffix)]):
+            remove(left)
 
 
 def link_file(source: Path, target: Path) -> None:

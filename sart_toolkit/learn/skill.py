@@ -228,6 +228,17 @@ class Skill:
         action[6] = self._commandable(action[6])
         return action
 
+    def __call__(self, observation: Mapping[str, Any]) -> Array:
+        """The action `(7,)` for an observation of `sart_toolkit.gym`, see `act`.
+
+        Args:
+            observation: `pixels`, images by camera, and `agent_pos`, the gripper first.
+
+        Raises:
+            InvalidInput: as `act`.
+        """
+        return self.act(observation["pixels"], float(observation["agent_pos"][0]))
+
     def _predict(self) -> Array:
         """The next actions `(k, 7)`."""
         observation = {

@@ -110,7 +110,7 @@ class ScriptedOperator(Device):
         spread = np.repeat([style.tremor, np.deg2rad(style.tremor_deg)], 3)
         keep = np.exp(-dt / style.tremor_time)
         noise = self._rng.standard_normal(6) * np.sqrt(1.0 - keep**2)
-        self._tremor = keep * self._tremor + noise * spread * (0.0 if resting else 1.0)
+        self._tremor = keep * self._tremor + noise * spread * (0.0 if resting else step.tremor)
         stop = self._still > style.rest
         return TeleopCommand(self._velocity + self._tremor, step.gripper, stop)
 

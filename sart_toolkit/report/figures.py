@@ -21,7 +21,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-u
 from PIL import Image as PillowImage
 from PIL import ImageDraw
 
-from sart_toolkit.data.records import Annotation, Demonstration, Episode, PrecisionSphere
+from sart_toolkit.data.records import Annotation, Demonstration, Episode, Image, PrecisionSphere
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import Array, check_array, frozen
 from sart_toolkit.report.video import OUTCOME_COLOURS, Outcome, font
@@ -88,6 +88,44 @@ def film_strip(
         draw.text(at, label, fill="#f2f4f7", font=text, anchor="mm")
     stream = io.BytesIO()
     strip.save(stream, "png", optimize=True)
+    return stream.getvalue()
+
+
+def montage(images: Sequence[Image], captions: Sequence[str], columns: int = 3) -> bytes:
+    """PNG bytes of images in rows, each with a caption below it.
+
+    Args:
+        images: uint8 `(H, W, 3)` each, at least one; each is shown as wide as the first.
+        captions: for each image, cut where there is no room.
+        columns: how many images beside each other.
+
+    Raises:
+        InvalidInput: there are no images, or not as many captions.
+    """
+    if not images or len(images) != len(captions):
+        raise InvalidInput(
+            f"images: expected at least one and a caption for each, got {len(images)} images and "
+            f"{len(captions)} captions"
+        )
+    width = images[0].shape[1]
+    size = (width, max(round(image.shape[0] * width / image.shape[1]) for image in images))
+    columns, gap, footer = min(columns, len(images)), 6, 20
+    rows = -(-len(images) // columns)
+    sheet = PillowImage.new(
+        "RGB", (gap + columns * (width + gap), gap + rows * (size[1] + footer + gap)), "#15181d"
+    )
+    draw, text = ImageDraw.Draw(sheet), font(12)
+    for i, (image, words) in enumerate(zip(images, captions, strict=True)):
+        left = gap + i % columns * (width + gap)
+        top = gap + i // columns * (size[1] + footer + gap)
+        pillow = PillowImage.fromarray(np.ascontiguousarray(image))
+        scaled = pillow.resize((width, round(image.shape[0] * width / image.shape[1])))
+        sheet.paste(scaled, (left, top))
+        while text.getlength(words) > width:
+            words = words[:-2].rstrip(" ,…") + "…"
+        draw.text((left, top + size[1] + footer / 2), words, fill="#f2f4f7", font=text, anchor="lm")
+    stream = io.BytesIO()
+    sheet.save(stream, "png", optimize=True)
     return stream.getvalue()
 
 
@@ -343,6 +381,71 @@ def training_curve(
         _quiet(axes)
         figure.tight_layout()
         return _png(figure)
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A success rate of a row and column: its Wilson interval, and the rates of single seeds."""
+
+    row: str
+    column: str
+    rate: float
+    low: float
+    high: float
+    units: tuple[float, ...]
+
+
+def rates_image(rates: Sequence[Rate], across: str, theme: Theme = "light") -> bytes:
+    """PNG bytes of success rates: a curve for each row if columns are numbers, else groups of dots.
+
+    Bars are Wilson intervals, small marks the rates of single seeds.
+
+    Args:
+        rates: at least one.
+        across: what columns are.
+        theme: `light` or `dark`.
+
+    Raises:
+        InvalidInput: there are none, or an unknown theme.
+    """
+    if not rates:
+        raise InvalidInput("rates: expected at least one; evaluate a cell")
+    rows = list(dict.fromkeys(rate.row for rate in rates))
+    columns = list(dict.fromkeys(rate.column for rate in rates))
+    numbers = all(column.isdecimal() for column in columns) and len(columns) > 1
+    series = rows if numbers else columns
+    with _figure((7.6, 3.6), theme) as figure:
+        axes = figure.add_subplot()
+        for k, name in enumerate(series):
+            shown = [rate for rate in rates if (rate.row if numbers else rate.column) == name]
+            offset = 0.7 * ((k + 0.5) / len(series) - 0.5)
+            x = np.array(
+                [float(rate.column) if numbers else rows.index(rate.row) + offset for rate in shown]
+            )
+            y = np.array([100 * rate.rate for rate in shown])
+            ends = np.array([[100 * rate.low, 100 * rate.high] for rate in shown]).T
+            colour = sphere_colour(k)
+            axes.errorbar(
+                x, y, np.maximum(np.abs(ends - y), 0), color=colour, marker="o", markersize=5,
+                capsize=2.5, linewidth=1.8, linestyle="-" if numbers else "", label=name,
+            )  # fmt: skip
+            for at, rate in zip(x, shown, strict=True):
+                each = [100 * unit for unit in rate.units]
+                axes.plot([at] * len(each), each, color=colour, marker="_", alpha=0.6, linestyle="")
+        if numbers:
+            axes.set_xscale("log")
+            axes.set_xticks([float(c) for c in columns], columns)
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        else:
+            axes.set_xticks(range(len(rows)), rows, rotation=20 if len(rows) > 3 else 0)
+            axes.set_xlim(-0.6, len(rows) - 0.4)
+        axes.set_xlabel(across if numbers else "")
+        axes.set_ylabel("success [%]")
+        axes.set_ylim(-4, 104)
+        _quiet(axes)
+        axes.legend(frameon=False, bbox_to_anchor=(1.01, 1), loc="upper left")
+        figure.tight_layout()
+        return _png(figure, tight=True)
 
 
 def placement_image(

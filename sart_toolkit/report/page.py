@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jinja2
+import numpy as np
+from PIL import Image as PillowImage
 
 from sart_toolkit.data.dataset import load_dataset
-from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.data.records import Annotation, Demonstration, Image
 from sart_toolkit.data.schemas import EvaluationFile, RunFile, TrainingFile
 from sart_toolkit.data.storage import (
     load_annotation,
@@ -26,10 +28,12 @@ from sart_toolkit.data.storage import (
     write_text,
 )
 from sart_toolkit.errors import BrokenFile, MissingFile, SartError
+from sart_toolkit.evaluate.failures import FailureKind, group_failures
 from sart_toolkit.report.figures import (
     SegmentPath,
     Theme,
     film_strip,
+    montage,
     placement_image,
     scene_image,
     segment_paths,
@@ -39,6 +43,8 @@ from sart_toolkit.report.figures import (
 
 MAX_VIDEO_BYTES = 48 * 2**20
 _FILM_IMAGES = 8
+# Of each kind of failure so many final images are shown.
+_LAST_IMAGES = 6
 
 Shown = dict[str, Any]
 
@@ -174,24 +180,27 @@ def _field(value: Any, file: str, *keys: str) -> Any:
 # --- images and numbers -----------------------------------------------------------------------
 
 
-def _data_uri(kind: str, content: bytes) -> str:
+def data_uri(kind: str, content: bytes) -> str:
+    """Content as an address that a page carries inside."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def _image(png: bytes, alt: str, dark: bytes | None = None) -> Shown:
+def image(png: bytes, alt: str, dark: bytes | None = None) -> Shown:
+    """A PNG as the templates' macros show it, with another one for dark screens."""
     # A PNG's width and height are the first two numbers of its first chunk.
     width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
     return {
-        "src": _data_uri("image/png", png),
-        "dark": None if dark is None else _data_uri("image/png", dark),
+        "src": data_uri("image/png", png),
+        "dark": None if dark is None else data_uri("image/png", dark),
         "alt": alt,
         "width": width,
         "height": height,
     }
 
 
-def _drawn(draw: Callable[[Theme], bytes], alt: str) -> Shown:
-    return _image(draw("light"), alt, draw("dark"))
+def drawn(draw: Callable[[Theme], bytes], alt: str) -> Shown:
+    """What is drawn in either theme, as the templates' macros show it."""
+    return image(draw("light"), alt, draw("dark"))
 
 
 # No line may end between a number and its unit.
@@ -346,7 +355,7 @@ def _demonstration(run: _Run) -> Shown | str:
     n = min(_FILM_IMAGES, len(d))
     end = duration(float(d.timestamps[-1] - d.timestamps[0]))
     alt = f"{n} images of the {camera} camera, evenly from the start to the end after {end}"
-    return {"camera": camera, "film": _image(film_strip(d, camera, n), alt)}
+    return {"camera": camera, "film": image(film_strip(d, camera, n), alt)}
 
 
 def _spheres(run: _Run) -> Shown | str:
@@ -357,8 +366,8 @@ def _spheres(run: _Run) -> Shown | str:
     annotation.check_matches(demonstration)
     if run.augmentation is not None:
         rows = _field(run.augmentation, "dataset.json", "by_sphere")
-        drawn = [row["waypoint"] for row in rows if row["source"] == 0]
-        if drawn != [sphere.waypoint for sphere in annotation.spheres]:
+        waypoints = [row["waypoint"] for row in rows if row["source"] == 0]
+        if waypoints != [sphere.waypoint for sphere in annotation.spheres]:
             # By a strategy that has spheres of its own.
             paths = ()
 
@@ -384,7 +393,7 @@ def _spheres(run: _Run) -> Shown | str:
         f"Two 3D views of the demonstrated tool path with {_plural(len(shown), 'precision sphere')}"
         + (f" and {_plural(len(paths), 'augmented path')} leading back to it" if paths else "")
     )
-    return {"drawing": _drawn(draw, alt), "spheres": shown}
+    return {"drawing": drawn(draw, alt), "spheres": shown}
 
 
 def _augmentation(run: _Run) -> Shown | str:
@@ -450,7 +459,7 @@ def _training(run: _Run) -> Shown | str:
         "epochs": len(curve),
         "seconds": sum(float(_field(row, file, "seconds")) for row in curve),
         "images_per_second": run.training.get("images_per_second"),
-        "curve": _drawn(draw, alt),
+        "curve": drawn(draw, alt),
     }
 
 
@@ -458,18 +467,58 @@ def _success(run: _Run) -> Shown | str:
     if run.evaluation is None:
         return "No evaluation.json in this run: the skill was not evaluated yet."
     episodes = _field(run.evaluation, "evaluation.json", "episodes")
-    reasons = collections.Counter(
-        str(e.get("reason") or "no reason given") for e in episodes if e.get("outcome") == "failure"
-    )
+    kinds = [
+        {
+            "reason": kind.reason,
+            "count": len(kind.episodes),
+            "reached": reached_words(kind),
+            "drawing": last_images(
+                [(run.directory, e) for e in episodes if e["episode"] in kind.episodes]
+            ),
+        }
+        for kind in group_failures(episodes)
+    ]
     at_any_time = None
     if "n_success_any" in run.evaluation:
         at_any_time = _success_rate(run.evaluation, "_any")
     return {
         "at_end": _success_rate(run.evaluation),
         "at_any_time": at_any_time,
-        "reasons": reasons.most_common(),
+        "kinds": kinds,
         "placements": _placements(run, episodes),
     }
+
+
+def reached_words(kind: FailureKind) -> str:
+    """How far along the demonstration failures of a kind came, and when."""
+    if kind.waypoint is None:
+        return "none came within 2 cm of the demonstrated path"
+    return f"waypoint {kind.waypoint:.0f}, after {kind.seconds:.1f}{_SPACE}s"
+
+
+def last_images(rollouts: Iterable[tuple[Path, Mapping[str, Any]]]) -> Shown | None:
+    """What cameras saw at the end of some rollouts, with how each ended; None where none is kept.
+
+    Args:
+        rollouts: directory and row of `evaluation.json`.
+    """
+    images: list[Image] = []
+    captions: list[str] = []
+    for directory, row in rollouts:
+        path = directory / str(row.get("final_image"))
+        if not path.is_file() or len(images) == _LAST_IMAGES:
+            continue
+        with PillowImage.open(path) as opened:
+            images.append(np.asarray(opened.convert("RGB")))
+        reached = row.get("progress")
+        moment = f"waypoint {reached['waypoint']} at {reached['seconds']:g} s; " if reached else ""
+        captions.append(f"{row['episode']}: {moment}{row.get('reason')}")
+    if not images:
+        return None
+    alt = (
+        f"What overview and wrist camera saw at the end of {_plural(len(images), 'failed rollout')}"
+    )
+    return image(montage(images, captions), alt)
 
 
 def _placements(run: _Run, episodes: Sequence[Mapping[str, Any]]) -> Shown | None:
@@ -489,7 +538,7 @@ def _placements(run: _Run, episodes: Sequence[Mapping[str, Any]]) -> Shown | Non
     good = outcomes.count("success")
     bad = len(places) - good
     alt = f"Top view of {len(places)} object placements: {good} successes, {bad} failures"
-    return _drawn(draw, alt)
+    return drawn(draw, alt)
 
 
 def _videos(run: _Run) -> Shown | str:
@@ -518,7 +567,7 @@ def _videos(run: _Run) -> Shown | str:
         room -= len(content)
         videos.append(
             {
-                "src": _data_uri("video/mp4", content),
+                "src": data_uri("video/mp4", content),
                 "episode": row.get("episode", "?"),
                 "outcome": str(row.get("outcome", "")),
                 "evaluated_outcome": row.get("evaluated_outcome"),
@@ -616,7 +665,8 @@ _SECTIONS: tuple[tuple[str, str, Callable[[_Run], Shown | str]], ...] = (
 
 
 @functools.cache
-def _templates() -> jinja2.Environment:
+def templates() -> jinja2.Environment:
+    """The pages' templates, with their filters."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sart_toolkit.report"),
         autoescape=True,
@@ -647,7 +697,7 @@ def _page(run: _Run) -> str:
                 {"title": title, "template": template, "shown": shown, "absent": absent}
             )
         return (
-            _templates()
+            templates()
             .get_template("page.html")
             .render(
                 task=task,

@@ -15,7 +15,7 @@ from sart_toolkit.errors import (
     Unreachable,
     unknown_name,
 )
-from sart_toolkit.poses import Array, check_array, check_pose, frozen
+from sart_toolkit.poses import Array, check_array, check_pose, frozen, inverse
 from sart_toolkit.robots.spec import Attachment, RobotSpec, check_gripper
 from sart_toolkit.robots.urdf import composed_urdf
 
@@ -104,6 +104,22 @@ class RobotModel:
         if joint == self._model.frames[self._tool].parentJoint:
             return "tool"
         return "world" if joint == 0 else None
+
+    def mounted_cameras(self) -> dict[str, tuple[CameraFrame, Array]]:
+        """Of the robot's cameras that move with the tool or stand still, by name: with which, and
+        their pose `(4, 4)` there, camera frame z forward, x right, y down.
+        """
+        found: dict[str, tuple[CameraFrame, Array]] = {}
+        for camera in self.spec.cameras:
+            mount = self.mount_of(camera.frame)
+            if mount is not None:
+                q = np.array(self.spec.home)
+                fixed = camera.frame == "world"
+                T_world_frame = np.eye(4) if fixed else self.fk(q, camera.frame)
+                T_world_mount = self.fk(q) if mount == "tool" else np.eye(4)
+                T_mount_frame = inverse(T_world_mount) @ T_world_frame
+                found[camera.name] = mount, T_mount_frame @ camera.T_frame_camera
+        return found
 
     def check_q(self, q: Array) -> Array:
         """A float64 copy of a joint configuration `(n,)`.

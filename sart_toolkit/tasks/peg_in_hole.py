@@ -1,4 +1,8 @@
-"""Peg-in-hole: lower a held square peg into a square hole."""
+"""Peg-in-hole: lower a held square peg into a square hole, as in the paper or a narrower one.
+
+The narrower ones aren't in the table of tasks: `sart_toolkit.tasks.peg_in_hole:PegInHole2mm` names
+the one whose peg has 2 mm of clearance on each side.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +32,12 @@ _WOOD = (0.86, 0.62, 0.30, 1.0)
 _PEG = (0.20, 0.45, 0.80, 1.0)
 
 
-def _block() -> Body:
-    """Four walls around a square hole; origin at the hole's centre on the table."""
-    wall = (_BLOCK_WIDTH - HOLE_WIDTH) / 2
-    middle = (HOLE_WIDTH + wall) / 2
+def _block(hole: float) -> Body:
+    """Four walls around a square hole so wide; origin at the hole's centre on the table."""
+    wall = (_BLOCK_WIDTH - hole) / 2
+    middle = (hole + wall) / 2
     z = HOLE_DEPTH / 2
-    long, short = (wall, _BLOCK_WIDTH, HOLE_DEPTH), (HOLE_WIDTH, wall, HOLE_DEPTH)
+    long, short = (wall, _BLOCK_WIDTH, HOLE_DEPTH), (hole, wall, HOLE_DEPTH)
     walls = [
         Shape("box", size, pose([x, y, z]), _WOOD)
         for size, x, y in (
@@ -44,10 +48,20 @@ def _block() -> Body:
         )
     ]
     # The floor of the hole is only drawn darker; the table carries the peg.
-    floor = Shape(
-        "box", (HOLE_WIDTH, HOLE_WIDTH, 0.001), pose([0, 0, 0.0005]), (0.12, 0.10, 0.09, 1), False
-    )
+    floor = Shape("box", (hole, hole, 0.001), pose([0, 0, 0.0005]), (0.12, 0.10, 0.09, 1), False)
     return Body("block", (*walls, floor))
+
+
+def _scene(hole: float) -> SceneSpec:
+    """The block with a hole so wide on the table, the peg in the gripper."""
+    peg = Attachment(
+        "peg",
+        "tool",
+        (Shape("box", (PEG_WIDTH, PEG_WIDTH, PEG_LENGTH), rgba=_PEG),),
+        pose([0, 0, _PEG_TIP_BELOW_TOOL - PEG_LENGTH / 2]),
+        mass=0.1,
+    )
+    return SceneSpec(bodies=(TABLE, _block(hole)), held=(peg,), cameras=(OVERVIEW,))
 
 
 class PegInHole(Task):
@@ -66,22 +80,8 @@ class PegInHole(Task):
     placement_range = 0.05
     horizon = 15.0
     report_body = "block"
-    scene = SceneSpec(
-        bodies=(
-            TABLE,
-            _block(),
-        ),
-        held=(
-            Attachment(
-                "peg",
-                "tool",
-                (Shape("box", (PEG_WIDTH, PEG_WIDTH, PEG_LENGTH), rgba=_PEG),),
-                pose([0, 0, _PEG_TIP_BELOW_TOOL - PEG_LENGTH / 2]),
-                mass=0.1,
-            ),
-        ),
-        cameras=(OVERVIEW,),
-    )
+    clearance = (HOLE_WIDTH - PEG_WIDTH) / 2
+    scene = _scene(HOLE_WIDTH)
 
     @staticmethod
     def _start() -> Array:
@@ -124,8 +124,41 @@ class PegInHole(Task):
         T = self._start()
         T[:3, :3] = hole[:3, :3] @ T[:3, :3]
         steps = []
-        for tip_height, speed, tolerance in ((0.012, 0.07, 0.004), (-_INSERTION, 0.03, 0.003)):
+        # Height of the tip, speed, tolerance, and that of the angle, how unsteady the hand is.
+        stages = [(0.012, 0.07, 0.004, 2.0, 1.0), (-_INSERTION, 0.03, 0.003, 2.0, 1.0)]
+        if self.clearance < 0.004:
+            # A person stops over the rim until the peg is well over the hole, and takes care.
+            exact = 0.25 * self.clearance
+            stages[1:] = [(0.003, 0.02, exact, 0.3, 0.1), (-_INSERTION, 0.03, 0.003, 2.0, 0.1)]
+        for tip_height, speed, tolerance, tolerance_deg, tremor in stages:
             T_step = T.copy()
             T_step[:3, 3] = hole[:3, 3] + [0, 0, HOLE_DEPTH + tip_height + _PEG_TIP_BELOW_TOOL]
-            steps.append(PlanStep(T_step, _GRIPPER, speed, tolerance))
+            steps.append(PlanStep(T_step, _GRIPPER, speed, tolerance, tolerance_deg, tremor=tremor))
         return steps
+
+
+class PegInHole5mm(PegInHole):
+    """Peg-in-hole with a hole of 4 cm: 5 mm of clearance on each side instead of 10.
+
+    Goal, randomisation and success: as `PegInHole`; nothing else has other numbers.
+    """
+
+    name, clearance, scene = "peg_in_hole_5mm", 0.005, _scene(PEG_WIDTH + 2 * 0.005)
+
+
+class PegInHole2mm(PegInHole):
+    """Peg-in-hole with a hole of 3.4 cm: 2 mm of clearance on each side instead of 10.
+
+    Goal, randomisation and success: as `PegInHole`; nothing else has other numbers.
+    """
+
+    name, clearance, scene = "peg_in_hole_2mm", 0.002, _scene(PEG_WIDTH + 2 * 0.002)
+
+
+class PegInHole1mm(PegInHole):
+    """Peg-in-hole with a hole of 3.2 cm: 1 mm of clearance on each side instead of 10.
+
+    Goal, randomisation and success: as `PegInHole`; nothing else has other numbers.
+    """
+
+    name, clearance, scene = "peg_in_hole_1mm", 0.001, _scene(PEG_WIDTH + 2 * 0.001)

@@ -64,7 +64,8 @@ class PlanStep:
     It ends when the tool has been within `tolerance` [m] and `tolerance_deg` for `pause` [s]
     (while fingers close, for instance). `speed` [m/s] is what a person would choose there;
     `gripper` is the command held throughout. With `through` the operator neither slows down before
-    the end nor hesitates after it: a point on a curve.
+    the end nor hesitates after it: a point on a curve. `tremor`: how unsteady the hand is, as a
+    fraction of its usual tremor; a person who has to be exact takes care.
     """
 
     T_world_tool: Array
@@ -74,6 +75,7 @@ class PlanStep:
     tolerance_deg: float = 2.0
     pause: float = 0.0
     through: bool = False
+    tremor: float = 1.0
 
 
 class Task(abc.ABC):
@@ -135,12 +137,8 @@ class Task(abc.ABC):
         """At how many steps up to the end the goal must have been reached."""
         return max(1, round(self.hold * record_hz))
 
-    def sample_placement(self, rng: np.random.Generator, yaw_deg: float = 0.0) -> Placement:
-        """A placement drawn uniformly from the square of half width `placement_range`.
-
-        Args:
-            rng: source of randomness.
-            yaw_deg: the object is also turned, uniformly within ± this [deg]; at 0 it is not.
+    def check_operable(self, yaw_deg: float) -> None:
+        """Return if the operator's plan copes with an object turned by up to ± this [deg].
 
         Raises:
             InvalidInput: `yaw_deg` is negative or beyond `yaw_range_deg`.
@@ -150,6 +148,18 @@ class Task(abc.ABC):
                 f"yaw_deg: {self.name} can be turned by 0 to {self.yaw_range_deg:g} deg either "
                 f"way, got {yaw_deg}"
             )
-        x, y = rng.uniform(-self.placement_range, self.placement_range, size=2)
+
+    def sample_placement(
+        self, rng: np.random.Generator, yaw_deg: float = 0.0, half_width: float | None = None
+    ) -> Placement:
+        """A placement drawn uniformly from a square.
+
+        Args:
+            rng: source of randomness.
+            yaw_deg: the object is also turned, uniformly within ± this [deg]; at 0 it is not.
+            half_width: of the square [m]; `placement_range` if left out.
+        """
+        half_width = self.placement_range if half_width is None else half_width
+        x, y = rng.uniform(-half_width, half_width, size=2)
         yaw = rng.uniform(-yaw_deg, yaw_deg) if yaw_deg else 0.0
         return Placement(float(x), float(y), float(yaw))

@@ -171,13 +171,15 @@ class _Unpacker(pickle.Unpickler):
 # --- a person's own modules ---------------------------------------------------------------------
 
 
-def _own_modules() -> list[Path]:
+def own_modules() -> list[Path]:
     """The files of the modules that were imported from neither Python, packages nor the toolkit."""
     others = [sys.prefix, sys.base_prefix, *site.getsitepackages(), site.getusersitepackages()]
     folders = [_PACKAGE, *map(Path, others)]
     files = [getattr(module, "__file__", None) for module in list(sys.modules.values())]
     paths = {Path(os.path.abspath(file)) for file in files if file is not None}
-    return [path for path in sorted(paths) if path.suffix == ".py" and not _within(path, folders)]
+    # Some modules name a file that isn't there, as torch's `_classes.py`.
+    own = (path for path in sorted(paths) if path.suffix == ".py" and path.is_file())
+    return [path for path in own if not _within(path, folders)]
 
 
 def _script() -> str | None:
@@ -197,7 +199,7 @@ class Home:
 
     def files_needed(self) -> list[Path]:
         """The person's own modules."""
-        return _own_modules()
+        return own_modules()
 
     def settle(self) -> None:
         """Let this process, which has copies of the files, find them as that machine does."""

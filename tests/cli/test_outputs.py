@@ -9,6 +9,9 @@ import pytest
 
 from sart_toolkit.cli import main
 from sart_toolkit.data.dataset import Dataset
+from sart_toolkit.data.formats import get_format
+from sart_toolkit.data.formats.format import about_dataset
+from sart_toolkit.data.formats.transfer import export_dataset
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.storage import OutputLock, save_annotation, save_demonstration
 from sart_toolkit.learn.skill import save_skill
@@ -25,6 +28,9 @@ VERBS = {
     "merge": "merge dataset --out OUT --overwrite",
     "split": "split dataset --n 3 --out OUT --overwrite",
     "split --parts": "split dataset --parts a=1 --out OUT --overwrite",
+    "export": "export dataset --format lerobot --out OUT --overwrite",
+    "export, a file": "export dataset --format robomimic --out OUT.hdf5 --overwrite",
+    "import": "import recording.rmb --out OUT --overwrite",
     "train": "train dataset --epochs 1 --out OUT --overwrite",
     "evaluate": "evaluate skill --episodes 1 --out OUT --overwrite",
     "report": "report run --out OUT --overwrite",
@@ -37,7 +43,12 @@ VERBS = {
     "benchmark cloud": f"benchmark cloud {CELLS} --overwrite",
     "benchmark skill": f"benchmark skill {CELLS}",
 }
-LOCKED = {"play": "OUT.mp4", "split --parts": "OUT/a", "benchmark skill": "OUT/benchmark.json"}
+LOCKED = {
+    "play": "OUT.mp4",
+    "export, a file": "OUT.hdf5",
+    "split --parts": "OUT/a",
+    "benchmark skill": "OUT/benchmark.json",
+}
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +63,9 @@ def inputs(
     save_demonstration(path / "demo.h5", peg_demonstration)
     save_annotation(path / "annotation.json", peg_annotation)
     shutil.copytree(peg_dataset.path, path / "dataset")
+    about = about_dataset(peg_demonstration)
+    export_dataset(peg_demonstration, get_format("rmb"), path / "recordings", about)
+    shutil.move(path / "recordings" / "peg_in_hole_0000.rmb", path / "recording.rmb")
     config = TrainConfig.for_policy(
         "compact_mlp", epochs=1, image_size=32, batch_size=16, hidden=16, threads=1, device="cpu"
     )

@@ -25,6 +25,7 @@ def test_first_skill_on_a_small_budget_and_running_it(tmp_path: Path) -> None:
     assert "of 2 succeeded" in run("01_first_skill.py", tmp_path, 5, 2, 2)
     said = run("02_run_a_skill.py", tmp_path / "skill")
     assert "succeeded" in said or "failed: " in said
+    assert "of 1 succeeded" in run("08_gymnasium.py", tmp_path / "skill", 1)
 
 
 def test_examples_are_short_and_import_what_is_public() -> None:

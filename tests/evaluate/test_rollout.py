@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from PIL import Image as PillowImage
 
 from sart_toolkit.data.records import DEFAULT_RATES
 from sart_toolkit.data.schemas import EvaluationFile
@@ -31,6 +32,7 @@ from sart_toolkit.evaluate.rollout import (
 from sart_toolkit.evaluate.statistics import wilson_interval
 from sart_toolkit.learn.skill import save_skill
 from sart_toolkit.learn.training import TrainConfig, train
+from sart_toolkit.scenes.appearance import AppearanceConfig
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement
 
@@ -44,7 +46,8 @@ class Player:
         self.actions = [np.array(action) for action in actions]
         self.config = SimpleNamespace(robot="ur5e_2f85", training=SimpleNamespace(policy="player"))
         self.cameras = ("wrist",)
-        self.demonstration = SimpleNamespace(rates=DEFAULT_RATES)
+        steps = SimpleNamespace(measured_Ts_world_tool=np.eye(4)[None], measured_gripper=np.ones(1))
+        self.demonstration = SimpleNamespace(rates=DEFAULT_RATES, task_parameters={}, steps=steps)
         self.seen = []
 
     def reset(self):
@@ -221,7 +224,7 @@ def test_objects_are_turned_and_the_appearance_varies_where_asked_for(evaluate, 
     for name, options in (
         ("plain", {}),
         ("turned", {"yaw_deg": 15.0}),
-        ("appearance", {"vary_appearance": True}),
+        ("appearance", {"appearance": AppearanceConfig()}),
     ):
         player = Watching()
         player.rollouts = []
@@ -252,8 +255,7 @@ def test_the_result_has_a_row_for_each_episode_and_what_they_come_to(
     assert result["ci95"] == result["ci95_any"] == list(wilson_interval(0, 3))
     assert result["seeds"] == {"eval_seed": 11, "episodes": [[11, 0], [11, 1], [11, 2]]}
     assert result["seconds"] > 0 and result["videos"] == [] and "python" in result["versions"]
-    asked = {"episodes": 3, "eval_seed": 11, "videos": 0, "yaw_deg": 0.0, "vary_appearance": False}
-    assert result["config"] == asked
+    assert result["config"] == dataclasses.asdict(config)
     for i, row in enumerate(result["episodes"]):
         assert row["episode"] == i and row["seed"] == [11, i] and row["steps"] == 6
         assert row["placement"] == {"block": episode_placement(short_task, 11, i).to_json()}
@@ -504,3 +506,119 @@ def test_a_skill_that_gives_nonsense_is_an_error_not_a_crash(roll_out):
 def test_a_bad_setting_is_refused(changes, message):
     with pytest.raises(InvalidInput, match=message):
         EvaluateConfig(**changes)
+
+
+# --- variations ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ticks", [1, 3, 4, 6])
+def test_with_latency_a_skill_sees_what_was_seen_so_much_earlier(
+    peg_backend, peg_model, peg_task, peg_demonstration, ticks
+):
+    """Its wrist images are those of a rollout of the same actions, some control steps before."""
+    actions = peg_demonstration.actions[:14]
+    peg_task = get_task("peg_in_hole")
+    peg_task.horizon = 1.4
+    seen = []
+
+    observe = peg_backend.observe
+    step, at = peg_backend.step, [0]
+
+    def count():
+        at[0] += 1
+        step()
+
+    def look(*cameras):
+        found = observe(*cameras)
+        seen.append((at[0], found))
+        return found
+
+    peg_backend.step, peg_backend.observe = count, look
+    try:
+        player = Player(actions)
+        run_rollout(player, peg_task, peg_backend, peg_model, Placement(), latency=ticks / 30)
+        shown = [images for images, _ in player.seen]
+        by_tick = {tick: found.cameras["wrist"].rgb for tick, found in seen}
+        start = min(by_tick)
+        for k, image in enumerate(shown):
+            np.testing.assert_array_equal(image, by_tick[start + max(0, 3 * k - ticks)])
+    finally:
+        del peg_backend.step, peg_backend.observe
+    assert len(shown) == 14
+
+
+def test_latency_that_is_no_whole_number_of_control_steps_is_refused(roll_out):
+    with pytest.raises(InvalidInput, match="latency: expected whole control steps of 1/30 s"):
+        roll_out(Player(), latency=0.05)
+
+
+def test_objects_are_placed_in_another_square_and_turned_farther_where_asked_for(
+    evaluate, short_task
+):
+    usual = evaluate(Player(), short_task, EvaluateConfig(4, 3))["episodes"]
+    config = EvaluateConfig(4, 3, placement_range=0.10, yaw_deg=30.0)
+    wide = evaluate(Player(), short_task, config)["episodes"]
+    for a, b in zip(usual, wide, strict=True):
+        assert b["placement"]["block"]["x"] == pytest.approx(2 * a["placement"]["block"]["x"])
+    turns = [row["placement"]["block"]["yaw_deg"] for row in wide]
+    assert max(map(abs, turns)) > short_task.yaw_range_deg
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"yaw_deg": -1}, "yaw_deg: expected 0 to 180"),
+        ({"placement_range": -0.1}, "placement_range: expected 0 to 1 m"),
+        ({"latency": -0.1}, "latency: expected 0 to 10 s"),
+    ],
+)
+def test_variations_that_can_not_be_are_refused(options, complaint):
+    with pytest.raises(InvalidInput, match=complaint):
+        EvaluateConfig(**options)
+
+
+def test_what_was_seen_at_the_end_of_a_failure_is_kept_if_asked(evaluate, short_task, tmp_path):
+    out = tmp_path / "e.json"
+    result = evaluate(Player(), short_task, EvaluateConfig(2, final_images=True), out=out)
+    for row in result["episodes"]:
+        assert row["final_image"] == f"e_failures/{row['episode']:03d}.png"
+        with PillowImage.open(tmp_path / row["final_image"]) as image:
+            # The overview and the square wrist image beside each other.
+            assert image.size == (384, 192)
+            assert np.ptp(np.asarray(image)[:, :192]) > 50 < np.ptp(np.asarray(image)[:, 192:])
+    assert read_json(out, EvaluationFile)["episodes"][1]["final_image"] == "e_failures/001.png"
+    with pytest.raises(InvalidInput, match="final_images: expected False without `out`"):
+        evaluate(Player(), short_task, EvaluateConfig(1, final_images=True))
+
+
+def test_of_a_success_no_final_image_is_kept_and_it_went_all_the_way(
+    evaluate, replay, peg_demonstration, tmp_path
+):
+    task = get_task("peg_in_hole")
+    task.placement_range = 0.002
+    player = Player(peg_demonstration.actions)
+    player.demonstration = peg_demonstration
+    config = EvaluateConfig(1, final_images=True)
+    (row,) = evaluate(player, task, config, out=tmp_path / "e.json")["episodes"]
+    assert row["outcome"] == "success" and "final_image" not in row
+    assert row["progress"]["of"] == len(peg_demonstration)
+    assert row["progress"]["waypoint"] > 0.7 * len(peg_demonstration)
+
+
+def test_a_failure_tells_how_far_along_the_demonstration_it_came(roll_out, peg_demonstration):
+    task = get_task("peg_in_hole")
+    task.horizon = 4.0
+    player = Player(peg_demonstration.actions[:20])
+    player.demonstration = peg_demonstration
+    result = roll_out(player, task=task)
+    assert not result.success and 17 <= result.progress.waypoint <= 22
+    assert 1.5 < result.to_json("block")["progress"]["seconds"] < 2.6
+    # Beside the hole it is nowhere near.
+    player = Player(peg_demonstration.actions[:20])
+    player.demonstration = peg_demonstration
+    assert roll_out(player, Placement(0.045, 0.045), task).progress is None
+
+
+def test_few_rollouts_are_warned_of(evaluate, short_task, caplog):
+    evaluate(Player(), short_task, EvaluateConfig(1))
+    assert "only 1 rollout: " in caplog.text

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,15 @@ from hypothesis import strategies as st
 from scipy.stats import binom, norm
 
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.evaluate.statistics import wilson_interval
+from sart_toolkit.evaluate.statistics import (
+    cluster_interval,
+    few_rollouts,
+    holm,
+    mcnemar_p,
+    spread,
+    unpaired_p,
+    wilson_interval,
+)
 
 
 @st.composite
@@ -117,3 +126,74 @@ def test_covers_the_true_rate_about_as_often_as_promised(n: int) -> None:
 def test_refuses_what_is_no_count_or_confidence(arguments: Any, message: str) -> None:
     with pytest.raises(InvalidInput, match=message):
         wilson_interval(*arguments)
+
+
+# --- units and tests ----------------------------------------------------------------------------
+
+
+def test_the_interval_over_units_is_wider_than_wilsons_where_units_differ() -> None:
+    rates, weights = [1.0, 0.5, 0.9, 0.4, 0.95], [40] * 5
+    found = cluster_interval(rates, weights)
+    assert found is not None
+    low, high = wilson_interval(150, 200)
+    assert found[1] - found[0] > high - low
+    assert found[0] < 0.75 < found[1]
+    assert found == cluster_interval(rates, weights), "the same each time"
+
+
+def test_units_count_by_their_rollouts() -> None:
+    found = cluster_interval([1.0, 0.0], [90, 10])
+    assert found == (0.0, 1.0)
+    low, _ = cluster_interval([1.0, 1.0, 1.0, 0.0], [30, 30, 30, 10]) or (0, 0)
+    even, _ = cluster_interval([1.0, 1.0, 1.0, 0.0], [25, 25, 25, 25]) or (0, 0)
+    assert low > even
+
+
+def test_one_unit_has_no_interval_and_equal_ones_have_no_width() -> None:
+    assert cluster_interval([0.9], [40]) is None and spread([0.9]) is None
+    assert cluster_interval([0.9, 0.9], [40, 40]) == (0.9, 0.9) and spread([0.9, 0.9]) == 0.0
+
+
+@pytest.mark.parametrize("weights", [[1], [1, 0]])
+def test_weights_that_do_not_fit_are_refused(weights: list[int]) -> None:
+    with pytest.raises(InvalidInput, match="weights: expected 2 positive ones"):
+        cluster_interval([0.5, 0.7], weights)
+
+
+def test_mcnemar_counts_only_pairs_that_differ() -> None:
+    # statsmodels.stats.contingency_tables.mcnemar([[101, 5], [16, 40]], exact=True)
+    assert mcnemar_p(5, 16) == pytest.approx(0.026603, abs=1e-6)
+    assert mcnemar_p(0, 0) == 1.0
+    with pytest.raises(InvalidInput, match="only_b: expected a whole number"):
+        mcnemar_p(1, 0.5)  # type: ignore[arg-type]
+
+
+def test_without_pairs_whole_tables_are_told_apart() -> None:
+    # The vaccine trial of scipy's documentation of barnard_exact.
+    assert unpaired_p((7, 12), (15, 15)) == pytest.approx(0.0681, abs=1e-3)
+    assert unpaired_p((0, 0), (9, 9)) == 1.0 == unpaired_p((9, 9), (9, 9))
+    assert unpaired_p((0, 20), (20, 20)) < 1e-6
+
+
+def test_holm_orders_p_values_and_never_lowers_one() -> None:
+    # statsmodels.stats.multitest.multipletests([0.01, 0.04, 0.03, 0.005], method="holm")
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == [] and holm([0.7, 0.9]) == [1.0, 1.0]
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
+def test_holm_keeps_the_order_and_stays_within_bonferroni(p_values: list[float]) -> None:
+    adjusted = holm(p_values)
+    for p, q in zip(p_values, adjusted, strict=True):
+        assert p <= q <= 1.0
+    order = sorted(range(len(p_values)), key=p_values.__getitem__)
+    assert [adjusted[i] for i in order] == sorted(adjusted)
+    assert min(adjusted) <= min(1.0, len(p_values) * min(p_values)) + 1e-12
+
+
+def test_few_rollouts_are_warned_of_with_what_they_leave_open() -> None:
+    assert few_rollouts(20) is None
+    warning = few_rollouts(10)
+    assert warning is not None and re.match(
+        r"only 10 rollouts: .* between 24% and 76%; take", warning
+    )

@@ -16,9 +16,12 @@ from sart_toolkit.data.records import Annotation, Demonstration, Image
 from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.report.figures import (
     SPHERE_COLOURS,
+    Rate,
     SegmentPath,
     film_strip,
+    montage,
     placement_image,
+    rates_image,
     scene_image,
     segment_paths,
     sphere_colour,
@@ -216,3 +219,35 @@ def test_drawing_does_without_pyplot() -> None:
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# --- benchmarks ---------------------------------------------------------------------------------
+
+
+def test_a_montage_shows_every_image_and_cuts_long_captions() -> None:
+    images = [np.full((60, 120, 3), 40 * k, np.uint8) for k in range(1, 5)]
+    sheet = pixels(montage(images, ["short", "x" * 200, "", "last"], columns=3))
+    assert sheet.shape == (6 + 2 * (60 + 20 + 6), 6 + 3 * (120 + 6), 3)
+    for k, (top, left) in enumerate(((6, 6), (6, 132), (6, 258), (92, 6)), 1):
+        assert (sheet[top : top + 60, left : left + 120] == 40 * k).all()
+    # The long caption ends before the next image's begins.
+    assert (sheet[66:86, 252:258] == sheet[0, 0]).all()
+
+
+@pytest.mark.parametrize("captions", [[], ["a", "b"]])
+def test_a_montage_without_images_or_captions_for_them_is_refused(captions: list[str]) -> None:
+    images = [np.zeros((8, 8, 3), np.uint8)] if captions else []
+    with pytest.raises(InvalidInput, match="images: expected at least one and a caption for each"):
+        montage(images, captions)
+
+
+def test_rates_are_a_curve_over_numbers_and_groups_of_dots_otherwise() -> None:
+    curve = [Rate("peg", n, r, r - 0.1, r, (r,)) for n, r in (("20", 0.5), ("100", 0.9))]
+    dots = [dataclasses.replace(rate, column=name) for rate, name in zip(curve, "ab", strict=True)]
+    drawn = [rates_image(rates, "n") for rates in (curve, dots)]
+    # One colour for the one curve; one for each column.
+    assert shows(drawn[0], SPHERE_COLOURS[0]) and not shows(drawn[0], SPHERE_COLOURS[1])
+    assert shows(drawn[1], SPHERE_COLOURS[0]) and shows(drawn[1], SPHERE_COLOURS[1])
+    assert drawn[0] != rates_image(curve, "n", "dark")
+    with pytest.raises(InvalidInput, match="rates: expected at least one"):
+        rates_image([], "n")

@@ -218,6 +218,30 @@ def test_evaluation_without_videos_or_placements_is_shown(
     assert "The evaluation made no videos." in written(run_dir).text
 
 
+def test_failures_are_shown_by_kind_with_how_far_they_came_and_what_was_seen(
+    run_dir: Path, edit_json: EditJson, small_png: bytes
+) -> None:
+    (run_dir / "evaluation_failures").mkdir()
+    (run_dir / "evaluation_failures" / "000.png").write_bytes(small_png)
+    rows = [
+        {
+            "episode": k,
+            "outcome": "failure",
+            "reason": f"peg {20 + 10 * k} mm beside the hole",
+            "progress": {"waypoint": 30 + k, "of": 60, "seconds": 4.0 + k},
+            "final_image": f"evaluation_failures/{k:03d}.png",
+        }
+        for k in range(3)
+    ]
+    edit_json(run_dir / "evaluation.json", {"videos": [], "episodes": rows})
+    page = written(run_dir)
+    assert "3 × peg 30 mm beside the hole" in page.text
+    assert "waypoint 31, after 5.0" in page.text
+    # Of the other two no image is there.
+    alts = [shown["alt"] for shown in page.all("img")]
+    assert "What overview and wrist camera saw at the end of 1 failed rollout" in alts
+
+
 def test_demonstration_without_images_leaves_a_note(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

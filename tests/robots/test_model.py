@@ -323,3 +323,22 @@ def test_limits_of_a_joint_that_slides_are_in_metres(make_tiny, tmp_path):
     )
     with pytest.raises(InvalidInput, match="wrist: 2.500 m is outside its limits"):
         RobotModel(make_tiny()).check_limits(np.array([0.0, 2.5]))
+
+
+def test_mounted_cameras_are_where_a_pose_of_the_arm_has_them(model):
+    """In the world where they stand still, with the tool where they move with it."""
+    spec = model.spec
+    wrist = spec.cameras[0]
+    still = dataclasses.replace(wrist, name="still", frame="world")
+    elbow = dataclasses.replace(wrist, name="elbow", frame="forearm_link")
+    both = RobotModel(dataclasses.replace(spec, cameras=(wrist, still, elbow)))
+    mounted = both.mounted_cameras()
+    assert {name: frame for name, (frame, _) in mounted.items()} == {
+        wrist.name: "tool",
+        "still": "world",
+    }
+    np.testing.assert_allclose(mounted["still"][1], wrist.T_frame_camera, atol=1e-12)
+    q = spec.home + 0.3
+    T_world_camera = both.fk(q) @ mounted[wrist.name][1]
+    expected = both.fk(q, wrist.frame) @ wrist.T_frame_camera
+    np.testing.assert_allclose(T_world_camera, expected, atol=1e-9)

@@ -2,16 +2,19 @@
 
 import dataclasses
 import json
+from contextlib import closing
 
 import numpy as np
 import pytest
 
 from sart_toolkit.backends import BACKENDS, make_backend
-from sart_toolkit.errors import InvalidInput
+from sart_toolkit.errors import InvalidInput, UnknownName
 from sart_toolkit.poses import distance
 from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.scenes.appearance import Appearance, AppearanceConfig, randomise_appearance
 from sart_toolkit.tasks import TASKS, get_task
+from sart_toolkit.tasks.task import Placement
 
 
 @pytest.fixture(params=TASKS)
@@ -111,3 +114,91 @@ def test_a_noted_appearance_that_is_none_is_refused(value, message):
 def test_a_bad_spread_is_refused(name, value):
     with pytest.raises(InvalidInput, match=f"{name}: expected a finite number >= 0"):
         AppearanceConfig(**{name: value})
+
+
+def test_only_what_is_named_varies(task):
+    robot = get_robot(task.robot)
+    for name, value in (("colour", 0.2), ("light", 0.5), ("camera_deg", 2.0)):
+        config = AppearanceConfig.only(**{name: value})
+        varied, scene = randomise_appearance(robot, task.scene, np.random.default_rng(0), config)
+        changed = {
+            "colour": repr(scene.bodies) != repr(task.scene.bodies),
+            "light": scene.light.intensity != task.scene.light.intensity,
+            "camera_deg": distance(
+                *(r.cameras[0].T_frame_camera for r in (robot, varied))
+            )[1] > 1e-6,
+        }  # fmt: skip
+        assert changed == {other: other == name for other in changed}
+    with pytest.raises(UnknownName, match="part of the appearance 'color': did you mean 'colour'"):
+        AppearanceConfig.only(color=0.1)
+
+
+def test_a_camera_offset_is_as_long_as_asked_for_in_any_direction(task):
+    robot, config = get_robot(task.robot), AppearanceConfig.only(camera_offset=0.002)
+    moved = []
+    for seed in range(5):
+        varied, _ = randomise_appearance(robot, task.scene, np.random.default_rng(seed), config)
+        T, T_was = (r.cameras[0].T_frame_camera for r in (varied, robot))
+        np.testing.assert_allclose(T[:3, :3], T_was[:3, :3], atol=1e-9)
+        moved.append(T[:3, 3] - T_was[:3, 3])
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 0.002)
+    assert np.ptp(moved, axis=0).min() > 1e-4
+
+
+def test_distractors_lie_on_the_table_off_all_other_bodies_and_touch_nothing(task):
+    robot, config = get_robot(task.robot), AppearanceConfig.only(distractors=6)
+    model = RobotModel(robot, task.scene.held)
+    placement = Placement(0.05, -0.05, 20.0)
+    Ts = task.initial_state(model, placement).Ts_world_body
+    _, scene = randomise_appearance(robot, task.scene, np.random.default_rng(3), config, Ts)
+    added = {
+        body.name: body.shapes[len(old.shapes) :]
+        for old, body in zip(task.scene.bodies, scene.bodies, strict=True)
+    }
+    shapes = added.pop("table")
+    assert len(shapes) == 6 and not any(added.values())
+    assert not any(shape.collides for shape in shapes)
+    for shape in shapes:
+        corners = shape.corners()
+        assert 0 <= corners[:, 2].min() < 0.005 and corners[:, 2].max() < 0.1
+        for body in task.scene.bodies:
+            if body.name != "table":
+                points = [c for s in body.shapes for c in s.corners()]
+                points = np.array(points) @ Ts[body.name][:3, :3].T + Ts[body.name][:3, 3]
+                gaps = np.linalg.norm(points[:, None, :2] - corners[None, :, :2], axis=-1)
+                assert gaps.min() > 0.005
+
+
+@pytest.mark.parametrize(
+    ("bodies", "complaint"),
+    [((), "no body that never moves"), (("table",), "no object for them to lie around")],
+)
+def test_distractors_need_something_to_lie_on_and_around(bodies, complaint):
+    task = get_task("peg_in_hole")
+    kept = tuple(body for body in task.scene.bodies if body.name in bodies)
+    scene = dataclasses.replace(task.scene, bodies=kept)
+    config = AppearanceConfig.only(distractors=1)
+    with pytest.raises(InvalidInput, match=complaint):
+        randomise_appearance(get_robot(task.robot), scene, np.random.default_rng(0), config)
+
+
+def test_the_wrist_camera_sees_distractors():
+    task = get_task("peg_in_hole")
+    robot = get_robot(task.robot)
+    state = task.initial_state(RobotModel(robot, task.scene.held), Placement())
+    config = AppearanceConfig.only(distractors=8)
+    _, varied = randomise_appearance(
+        robot, task.scene, np.random.default_rng(1), config, state.Ts_world_body
+    )
+    images = []
+    for scene in (task.scene, varied):
+        with closing(make_backend("pybullet", robot, scene, 64)) as backend:
+            backend.reset(state)
+            images.append(backend.observe(("wrist",)).cameras["wrist"].rgb.astype(int))
+    assert (np.abs(images[0] - images[1]).max(axis=-1) > 20).sum() > 30
+
+
+@pytest.mark.parametrize("distractors", [-1, 1.5])
+def test_a_number_of_distractors_that_is_none_is_refused(distractors):
+    with pytest.raises(InvalidInput, match="distractors: expected a"):
+        AppearanceConfig(distractors=distractors)

@@ -1,14 +1,21 @@
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sart_toolkit.backends import make_backend
 from sart_toolkit.backends.interface import Observation
+from sart_toolkit.benchmark.cells import Cell
+from sart_toolkit.benchmark.operator import BenchmarkConfig, benchmark_operator
 from sart_toolkit.poses import interpolate, pose
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
-from sart_toolkit.tasks.peg_in_hole import HOLE_DEPTH, PEG_LENGTH
+from sart_toolkit.tasks.peg_in_hole import HOLE_DEPTH, PEG_LENGTH, PEG_WIDTH
 from sart_toolkit.tasks.task import Placement
 
 TASK = get_task("peg_in_hole")
@@ -118,3 +125,37 @@ def test_only_a_peg_in_the_hole_is_a_success(
     assert touched == ({tuple(sorted(("peg", touches)))} if touches else set())
     observation = peg_backend.observe()
     assert TASK.success(observation) == (touches is None and tilt_deg == 0)
+
+
+# --- narrower holes -----------------------------------------------------------------------------
+
+NARROW = {0.005: "PegInHole5mm", 0.002: "PegInHole2mm", 0.001: "PegInHole1mm"}
+
+
+@pytest.mark.parametrize("clearance", NARROW)
+def test_a_narrow_hole_leaves_so_much_on_each_side_of_the_peg(clearance):
+    task = get_task(f"sart_toolkit.tasks.peg_in_hole:{NARROW[clearance]}")
+    assert task.name == f"peg_in_hole_{1e3 * clearance:.0f}mm"
+    (block,) = (body for body in task.scene.bodies if body.name == "block")
+    corners = np.concatenate([shape.corners() for shape in block.shapes if shape.collides])
+    for axis in (0, 1):
+        inner = np.abs(corners[:, axis])[np.abs(corners[:, axis]) < 0.05]
+        assert inner.min() == pytest.approx(PEG_WIDTH / 2 + clearance)
+        assert np.abs(corners[:, axis]).max() == pytest.approx(0.055)
+    assert repr(task.scene.held) == repr(TASK.scene.held)
+
+
+@pytest.mark.parametrize("clearance", [0.002, 0.001])
+def test_the_operator_masters_narrow_holes(clearance, tmp_path):
+    task = get_task(f"sart_toolkit.tasks.peg_in_hole:{NARROW[clearance]}")
+    make = functools.partial(make_backend, "pybullet", get_robot(task.robot), task.scene, 16)
+    cell = Cell(task, "pybullet", make)
+    result = benchmark_operator([cell], BenchmarkConfig(2, seed=3), tmp_path / "out.json")
+    assert result["cells"][cell.name]["n_success"] == 2
+
+
+def test_the_usual_plan_is_as_it_was_before_there_were_narrow_holes():
+    model = RobotModel(get_robot(TASK.robot), TASK.scene.held)
+    above, inside = TASK.plan(TASK.initial_state(model, Placement()))
+    assert (above.speed, above.tolerance, above.tolerance_deg, above.tremor) == (0.07, 0.004, 2, 1)
+    assert (inside.speed, inside.tolerance, inside.tremor) == (0.03, 0.003, 1)

@@ -107,7 +107,14 @@ def test_yaw_is_drawn_only_where_asked_for_and_within_what_the_operator_masters(
     drawn = [task.sample_placement(rng, largest).yaw_deg for _ in range(200)]
     assert 0.8 * largest < np.abs(drawn).max() <= largest
     with pytest.raises(InvalidInput, match="yaw_deg: .* can be turned by 0 to"):
-        task.sample_placement(rng, largest + 1)
+        task.check_operable(largest + 1)
+    task.check_operable(largest)
+
+
+def test_a_placement_is_drawn_from_another_square_where_one_is_given(task):
+    rngs = [np.random.default_rng(3) for _ in range(2)]
+    usual, wide = task.sample_placement(rngs[0]), task.sample_placement(rngs[1], half_width=0.15)
+    assert wide.x == pytest.approx(usual.x * 0.15 / task.placement_range)
 
 
 def test_success_counts_as_achieved_when_it_lasted_until_the_end(task):

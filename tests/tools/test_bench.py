@@ -49,6 +49,15 @@ def test_the_training_data_benchmark_compares_a_file_with_a_copy(capsys):
     assert "read 4/4" in err and "block 2/2" in err
 
 
+def test_the_formats_benchmark_compares_each_with_raw_images(capsys):
+    assert bench.main(["formats", "--n", "3", "--image-size", "16"]) == 0
+    rows = json.loads(capsys.readouterr().out.splitlines()[-1])["figures"]["trajectories"]["3"]
+    assert set(rows) == {"frames", "ours", "raw", *bench.FORMATS}
+    assert rows["raw"]["bytes_per_frame"] == 16 * 16 * (3 + 4)
+    for name in bench.FORMATS:
+        assert rows[name]["bytes_per_frame"] > 0 and rows[name]["frames_per_second"] > 0
+
+
 def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
     arguments = "augment --n 2 --image-size 16 --repeats 1"
     assert bench.main(arguments.split()) == 0
