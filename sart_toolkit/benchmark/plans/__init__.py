@@ -22,6 +22,7 @@ PLANS = (
     "miles_radii",
     "effort",
     "transfer",
+    "recordings",
     "placement",
     "robustness",
     "precision",
