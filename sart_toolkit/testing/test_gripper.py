@@ -34,7 +34,8 @@ def test_the_fingers_are_as_far_apart_as_the_gripper_s_value_says(bench: Bench) 
 def test_the_gripper_moves_no_faster_than_its_speed(bench: Bench) -> None:
     """It takes its time, and is still on its way when the arm has moved on."""
     spec = bench.model.spec.gripper
-    per_period = spec.speed / spec.closed_position / bench.hz
+    travel = abs(spec.closed_position - spec.open_position)
+    per_period = spec.speed / travel / bench.hz
     bench.reset(gripper=0.0)
     before = bench.see().gripper
     for _ in range(15):
