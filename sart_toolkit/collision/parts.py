@@ -6,7 +6,6 @@ import functools
 import xml.etree.ElementTree as ET
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 
 import coal
 import numpy as np
@@ -59,20 +58,6 @@ def robot_parts(model: RobotModel) -> list[ConvexPart]:
         InvalidInput: a part is neither a mesh nor a box, sphere or cylinder.
         BrokenFile: the URDF's shapes can't be read, or not all of them were.
     """
-    # Its meshes lie beside it, in a folder named by their content: read once in a process.
-    key = model.urdf, model.urdf.read_bytes()
-    if key not in _parts:
-        if len(_parts) >= _MOST_ROBOTS:
-            del _parts[next(iter(_parts))]
-        _parts[key] = _read_parts(model)
-    return list(_parts[key])
-
-
-_MOST_ROBOTS = 8
-_parts: dict[tuple[Path, bytes], list[ConvexPart]] = {}
-
-
-def _read_parts(model: RobotModel) -> list[ConvexPart]:
     pinocchio_model = model.pinocchio_model
     try:
         loaded = pin.buildGeomFromUrdf(

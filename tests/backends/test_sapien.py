@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import coal
 import numpy as np
@@ -565,16 +564,3 @@ def test_without_sapien_the_extra_is_named():
 def test_a_shape_that_is_not_known_is_refused():
     with pytest.raises(InvalidInput, match="geometry Capsule is neither a mesh nor a box, sphere"):
         primitive(coal.Capsule(0.1, 0.2))
-
-
-def test_a_joint_without_limits_is_refused(monkeypatch, tmp_path):
-    model = RobotModel(get_robot("ur5e_hande"))
-    text = model.urdf.read_text()
-    broken = tmp_path / "robot.urdf"
-    at = text.index('name="gripper_right_jaw_joint"')
-    broken.write_text(text[:at] + text[at:].replace('"prismatic"', '"continuous"', 1))
-    for mesh in Path(model.urdf).parent.glob("*.obj"):
-        (tmp_path / mesh.name).symlink_to(mesh)
-    monkeypatch.setattr("sart_toolkit.robots.model.composed_urdf", lambda *_: broken)
-    with pytest.raises(InvalidInput, match="is continuous, expected one with limits"):
-        SapienBackend(get_robot("ur5e_hande"), SceneSpec(()), 16)

@@ -94,7 +94,7 @@ def test_a_stage_depends_on_sources_up_to_its_own_package_and_no_later_ones(monk
 
 def test_every_package_that_a_stage_may_import_is_among_its_sources():
     """In their order; those above the stages decide no result."""
-    above = {"report", "benchmark", "testing", "cli", "assets"}
+    above = {"bringup", "report", "benchmark", "testing", "cli", "assets"}
     packages = {path.name for path in module._PACKAGE.iterdir() if (path / "__init__.py").exists()}
     assert packages - above == {name for name in module._SOURCES if not name.endswith(".py")}
 

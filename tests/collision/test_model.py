@@ -39,7 +39,7 @@ kinds = st.sampled_from(["boxes", "rods", "shelf", "mixed"])
 
 def joints_near(placed, rng, spread=1.5):
     model = placed.kinematics
-    away = rng.uniform(-spread, spread, 6)
+    away = rng.uniform(-spread, spread, len(model.spec.home))
     return np.clip(model.spec.home + away, model.lower, model.upper)
 
 
@@ -339,7 +339,8 @@ def test_parts_enclose_all_collision_geometry_and_are_hardly_larger(robot, gripp
             larger = (np.concatenate(parts[link]) @ axis).max()
             larger -= (np.concatenate(points) @ axis).max()
             assert larger < (0.01 if link in round_ else 1e-6), link
-    assert {"forearm_link", "wrist_3_link", *get_robot(robot).gripper.finger_links} < set(seen)
+    assert {*get_robot(robot).gripper.finger_links} < set(seen)
+    assert {part.joint for part in placed.parts} == set(range(model.pinocchio_model.njoints))
 
 
 def test_a_ball_at_a_vertex_of_any_link_overlaps_it(probed, peg_model, start):
@@ -673,7 +674,7 @@ def test_distances_are_those_of_pybullet(robot, peg_task, rng):
             # Nothing that PyBullet finds nearest is missing here.
             nearest = points.nearest(q, 0.2)
             assert placed.nearest(q).distance <= max(nearest.distance, 0) + TOO_NEAR
-    assert overlaps > 100
+    assert overlaps > 50
     assert apart > 500
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sart_toolkit.errors import MissingExtra
-from sart_toolkit.robots import ROBOTS, get_robot
+from sart_toolkit.robots import USUAL_ROBOTS, get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.testing import bench as bench_module
 from sart_toolkit.testing import options, scenes
@@ -43,11 +43,11 @@ def test_a_module_in_the_working_folder_is_found(run_pytest, tmp_path):
     assert "1 passed" in result.stdout, result.stdout + result.stderr
 
 
-def test_by_default_all_our_backends_are_tested_with_all_robots(run_pytest, tmp_path):
+def test_by_default_all_our_backends_are_tested_with_the_usual_robots(run_pytest, tmp_path):
     result = run_pytest(tmp_path, "--collect-only", "-q", "-k", "abilities_are_known")
     found = [line for line in result.stdout.splitlines() if "::" in line]
     targets = {line.partition("[")[2].rstrip("]") for line in found}
-    assert targets == {f"{b}-{r}" for b in ("pybullet", "sapien") for r in ROBOTS}
+    assert targets == {f"{b}-{r}" for b in ("pybullet", "sapien") for r in USUAL_ROBOTS}
 
 
 def test_pytest_finds_the_options_by_the_module_s_own_name():
@@ -63,7 +63,7 @@ def test_without_pytest_the_extra_is_named(monkeypatch):
         importlib.import_module(bench_module.__name__)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", USUAL_ROBOTS)
 def test_scenes_are_laid_out_under_a_tool_that_points_down(name):
     robot = get_robot(name)
     T = RobotModel(robot).fk(scenes.ready_joints(robot))
@@ -71,7 +71,7 @@ def test_scenes_are_laid_out_under_a_tool_that_points_down(name):
     assert T[:2, 3] == pytest.approx(scenes.site(robot)[:2, 3])
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", USUAL_ROBOTS)
 def test_the_fingers_of_a_closed_gripper_meet_and_those_of_an_open_one_do_not(name):
     bench = make_bench("pybullet", name)
     widths = {"ur5e_2f85": 0.085, "ur5e_hande": 0.05}
