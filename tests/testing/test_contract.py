@@ -9,7 +9,7 @@ import pytest
 
 from sart_toolkit.backends import BACKENDS, make_backend
 from sart_toolkit.errors import MissingExtra
-from sart_toolkit.robots import ROBOTS, USUAL_ROBOTS, get_robot
+from sart_toolkit.robots import USUAL_ROBOTS, get_robot
 from sart_toolkit.scenes.spec import SceneSpec
 
 HERE = Path(__file__).parent
@@ -20,13 +20,7 @@ def _summary(outcome):
     return "\n\n".join(f"{test}: {message}" for test, message in outcome.failed.items())
 
 
-@pytest.mark.parametrize(
-    "robot",
-    [
-        robot if robot in USUAL_ROBOTS else pytest.param(robot, marks=pytest.mark.slow)
-        for robot in ROBOTS
-    ],
-)
+@pytest.mark.parametrize("robot", USUAL_ROBOTS)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_our_backends_keep_the_whole_contract(run_suite, backend, robot):
     """Nothing is skipped; images may be where SART_NO_IMAGES says that nothing can draw."""
