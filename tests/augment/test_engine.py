@@ -317,14 +317,12 @@ def test_episodes_tell_the_force_that_was_measured_or_that_none_was(
 
 
 def test_joint_velocities_of_an_episode_are_those_of_its_own_motion(peg_dataset):
-    compared = 0
     for episode in peg_dataset:
         q, dq = episode.steps.joint_positions, episode.steps.joint_velocities
         moved = np.diff(q, axis=0)
         fast = np.abs(moved) > 0.02
-        compared += fast.sum()
+        assert fast.any()
         np.testing.assert_array_equal(np.sign(moved)[fast], np.sign(dq[1:])[fast])
-    assert compared > 50
 
 
 def test_what_a_sphere_cannot_give_is_asked_of_the_others_and_said_with_the_reason(

@@ -674,7 +674,8 @@ def test_distances_are_those_of_pybullet(robot, peg_task, rng):
             # Nothing that PyBullet finds nearest is missing here.
             nearest = points.nearest(q, 0.2)
             assert placed.nearest(q).distance <= max(nearest.distance, 0) + TOO_NEAR
-    assert overlaps > 50
+    # The last joints of panda are farther apart.
+    assert overlaps > (100 if robot in USUAL_ROBOTS else 50)
     assert apart > 500
 
 

@@ -6,6 +6,7 @@ import re
 import shlex
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -49,4 +50,11 @@ def test_the_format_of_one_s_own_works(
 
 def test_the_environment_on_the_page_runs() -> None:
     (code,) = blocks(GYM_PAGE)
-    exec(textwrap.dedent(code).replace("num_envs=4", "num_envs=1") + "envs.close()\n", {})
+    made: dict[str, Any] = {}
+    exec(textwrap.dedent(code).replace("num_envs=4", "num_envs=1"), made)
+    try:
+        assert made["observation"] in made["env"].observation_space
+        assert made["observation"]["pixels"]["wrist"].shape == (128, 128, 3)
+        assert not made["info"]["is_success"] and made["envs"].num_envs == 1
+    finally:
+        made["envs"].close()
