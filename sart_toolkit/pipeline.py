@@ -1197,7 +1197,7 @@ def run(
     demonstrations: int | None = None,
     episodes: int = 50,
     epochs: int | None = None,
-    distribution: Literal["paper", "area"] = "paper",
+    distribution: Literal["paper", "area"] = "area",
     recording: Recording = "reversed",
     cameras: Sequence[str] = ("wrist",),
     image_size: ImageSize = 128,

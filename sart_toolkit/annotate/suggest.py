@@ -48,7 +48,8 @@ class SuggestConfig:
 
     `margin` [m] stays free everywhere: room for augmentation's own margin, the tracking error and
     the stillness of bodies that it proves for (0.7 mm by default on our simulators). No radius is
-    below `min_radius` or above `max_radius` [m];
+    below `min_radius` or above `max_radius` [m]; where waypoints are chosen, a radius is no less
+    than the previous one divided by `shrink`, if the demonstration allows that.
     `rotation_per_metre` [rad/m] is the augmentation's nu_r; `probes` is the number of poses at
     which the whole robot is checked in a wide sphere.
     """
@@ -56,6 +57,7 @@ class SuggestConfig:
     margin: float = 0.0008
     min_radius: float = 0.004
     max_radius: float = 0.15
+    shrink: float = 2.0
     rotation_per_metre: float = ROTATION_PER_METRE
     probes: int = 24
 
@@ -70,6 +72,8 @@ class SuggestConfig:
             raise InvalidInput(
                 f"max_radius {self.max_radius} m is below min_radius {self.min_radius} m"
             )
+        if not self.shrink > 1:
+            raise InvalidInput(f"shrink: expected a factor above 1, got {self.shrink}")
         if self.probes < 1:
             raise InvalidInput(f"probes: expected at least 1, got {self.probes}")
 
@@ -465,9 +469,11 @@ def suggest_annotation(
 ) -> Annotation:
     """Precision spheres for a demonstration, their radii from where its obstacles were.
 
-    Without `waypoints`, spheres tile the free part: the first at the start, each next one at the
-    convergence waypoint of the one before, or at the first later waypoint with room for
-    `min_radius`. A sphere is no larger than lets the tool rejoin the demonstration before the next
+    Without `waypoints`, spheres tile the free part in a funnel. The first is at the start. Each
+    next one is at the last waypoint, up to the convergence waypoint of the previous one, with a
+    radius of no less than the previous one's divided by `shrink`; where radii shrink faster than
+    that from one waypoint to the next, at that next one. Waypoints without room for `min_radius`
+    are left out. A sphere is no larger than lets the tool rejoin the demonstration before the next
     grasp, release or contact; an object in the grasp counts as part of the tool.
 
     Args:
@@ -481,12 +487,12 @@ def suggest_annotation(
         InvalidInput: a waypoint is out of range or has no room, or no waypoint has room.
     """
     config = config or SuggestConfig()
+    reached = progress or (lambda t: None)
     last = len(demonstration) - 1
 
+    @functools.cache
     def sphere_at(t: int) -> tuple[Suggestion, PrecisionSphere | None]:
         found = suggest_radius(world, demonstration, t, config)
-        if progress is not None:
-            progress(t)
         if found.radius < config.min_radius:
             return found, None
         # Whole micrometres, rounded down: coal's last digits depend on what it computed before.
@@ -504,6 +510,7 @@ def suggest_annotation(
     if waypoints is not None:
         for t in sorted(set(waypoints)):
             found, sphere = sphere_at(t)
+            reached(t)
             if sphere is None:
                 reason = found.limited_by
                 if found.clearance is not None:
@@ -517,6 +524,7 @@ def suggest_annotation(
         t = 0
         while t < last:
             _, sphere = sphere_at(t)
+            reached(t)
             if sphere is None:
                 t += 1
                 continue
@@ -524,7 +532,9 @@ def suggest_annotation(
             ahead = convergence_waypoint(demonstration, sphere)
             if ahead >= last:
                 break
-            t = ahead
+            least = sphere.radius / config.shrink
+            wide = (u for u in range(ahead, t, -1) if sphere_at(u)[0].radius >= least)
+            t = next(wide, t + 1)
     if not spheres:
         raise InvalidInput(
             f"no waypoint has room for a sphere of {config.min_radius * 1e3:.1f} mm; start the "

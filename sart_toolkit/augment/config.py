@@ -29,9 +29,10 @@ class AugmentConfig:
 
     `n`: trajectories in all, the demonstrations among them; the others are allocated to the spheres
     (see `allocate`) weighted by radius, or with `allocation` "equal" all the same, as in the paper.
-    `duration` [s] is the paper's delta, the least that a segment takes, rounded up to whole
-    recorded steps. Every segment is proved to keep `margin` [m] free of the `obstacles`, the bodies
-    of the scene or the cloud that the demonstration's cameras saw (made as `cloud` says): as
+    `duration` [s] is the paper's delta (2 s), the least that a segment takes, rounded up to whole
+    recorded steps; `None`: as long as the demonstration takes for as much motion near the waypoint,
+    from 0.4 to 2 s. Every segment is proved to keep `margin` [m] free of the `obstacles`, the
+    bodies of the scene or the cloud that the demonstration's cameras saw (made as `cloud` says): as
     measured, even if what is grasped has slipped by `slip_tolerance` [m] and bodies have moved by
     `BODY_STILLNESS`; as commanded, even if the robot is off its path by its backend's
     `tracking_error` besides. A segment on which any of these was exceeded is rejected. `cameras`:
@@ -46,7 +47,7 @@ class AugmentConfig:
     allocation: str = "radius"
     strategy: str | Strategy = "sart"
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    duration: float = 2.0
+    duration: float | None = None
     margin: float = 0.0002
     slip_tolerance: float = IN_GRASP_SLIP
     obstacles: Source = "scene"
@@ -70,7 +71,8 @@ class AugmentConfig:
             raise unknown_name("obstacles", self.obstacles, SOURCES)
         if self.recording not in get_args(Recording):
             raise unknown_name("recording", self.recording, get_args(Recording))
-        check_positive("duration", self.duration, "s")
+        if self.duration is not None:
+            check_positive("duration", self.duration, "s")
         for name in ("margin", "slip_tolerance"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):

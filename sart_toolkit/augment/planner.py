@@ -12,6 +12,7 @@ from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.collision.phases import BODY_STILLNESS, OUT_AND_BACK_STILLNESS
 from sart_toolkit.collision.world import CollisionWorld
+from sart_toolkit.data.pace import Pace
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.errors import MotionRejected, Unreachable
 from sart_toolkit.motion.controller import settling_targets
@@ -24,6 +25,8 @@ from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec
 
 _PATH_SAMPLES = 1000
+# [s], of segments at the demonstration's pace; the paper's are all as long as the longest.
+_DURATIONS = 0.4, 2.0
 # Sums of margins are to a nanometre what their parts say.
 _DIGITS = 9
 
@@ -47,6 +50,7 @@ class SegmentPlanner:
         self.world = world
         self.demonstration_hash = world.demonstration.content_hash()
         self._config, self._source = config, source
+        self._pace = Pace(world.demonstration)
         self._spheres = get_strategy(config.strategy).spheres(world.demonstration, annotation)
         self._approaches: dict[int, Array] = {}
         # What is proved of them, by waypoint and margin: all segments from a waypoint share it.
@@ -92,6 +96,19 @@ class SegmentPlanner:
             )
         return self._approaches[t]
 
+    def duration(self, proposal: Proposal) -> float:
+        """How long [s] the segment to a drawn pose takes, if joints and strides allow it.
+
+        At the demonstration's pace: a policy would learn to creep where segments are much slower
+        than what they lead to. In whole recorded steps.
+        """
+        seconds = self._config.duration
+        if seconds is None:
+            sampled = proposal.T_world_sampled
+            seconds = np.clip(self._pace.time_for(proposal.t_star, sampled), *_DURATIONS)
+        hz = self.world.demonstration.rates.record_hz
+        return float(np.ceil(round(seconds * hz, _DIGITS)) / hz)
+
     def plan(
         self,
         proposal: Proposal,
@@ -125,6 +142,7 @@ class SegmentPlanner:
         q, T = steps.commanded_joint_positions[t], steps.commanded_Ts_world_tool[t]
         T_goal = proposal.T_world_sampled
         self.world.check_known(t)
+        duration = self.duration(proposal)
         if (t, margin) not in self._approach_proofs:
             proof = self.world.certify(t, PolylinePath(self.approach(t)), margin)
             self._approach_proofs[t, margin] = proof
@@ -132,7 +150,7 @@ class SegmentPlanner:
         approach.check_free()
         try:
             motion = straight_line(
-                self.world.kinematics, q, T, T_goal, config.duration, record_hz=record_hz
+                self.world.kinematics, q, T, T_goal, duration, record_hz=record_hz
             )
             certificate = self.world.certify(t, motion.path, margin)
             certificate.check_free()
@@ -143,7 +161,7 @@ class SegmentPlanner:
                 self.world.placed(t),
                 q,
                 T_goal,
-                config.duration,
+                duration,
                 margin,
                 rng,
                 record_hz=record_hz,

@@ -112,7 +112,7 @@ class _Segments:
             row["planned"] = {
                 "clearance": certificate.clearance,
                 "duration": motion.duration,
-                "lengthened": motion.duration > self._augment.duration,
+                "lengthened": motion.duration > planner.duration(proposal),
             }
         attempt = executor.attempt(AttemptKey(0, at, k))
         row["outcome"] = attempt.outcome

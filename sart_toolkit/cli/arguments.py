@@ -194,7 +194,7 @@ class Run:
     eval_seed: _EVAL_SEED = 1000
     cameras: _CAMERAS = "wrist"
     image_size: _IMAGE = "128"
-    distribution: _DISTRIBUTION = "paper"
+    distribution: _DISTRIBUTION = "area"
     recording: _RECORDING = "reversed"
     epochs: _EPOCHS = None
     workers: _WORKERS = 2
@@ -421,17 +421,19 @@ class Augment:
         Literal["radius", "equal"],
         arg(help="Allocation of trajectories to spheres: by radius, or equally as in the paper."),
     ] = "radius"
-    distribution: _DISTRIBUTION = "paper"
+    distribution: _DISTRIBUTION = "area"
     rotation_per_metre: Annotated[
         float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")
     ] = 2.0
     duration: Annotated[
-        float,
-        arg(
-            help="Seconds each segment takes, delta, rounded up to whole recorded steps; more "
-            "where the joints need it."
+        float | None,
+        _optional(
+            "SECONDS",
+            "Seconds each segment takes, delta (in the paper 2), rounded up to whole recorded "
+            "steps; more where the joints need it. If left out, as long as the demonstration takes "
+            "for as much motion near its waypoint, from 0.4 to 2 s.",
         ),
-    ] = 2.0
+    ] = None
     execution: Annotated[
         str,
         arg(
@@ -697,6 +699,14 @@ class Train:
         Literal["batch", "group"] | None,
         _optional("{batch,group}", "Normalisation layers, of resnet18_mlp; its own if left out."),
     ] = None
+    weighting: Annotated[
+        Literal["balanced", "trajectories"],
+        arg(
+            help="How often steps are learned from: balanced, so that what all trajectories share "
+            "and where the tool stands still count less and gripper events more; or as often as "
+            "trajectories pass them, as in the paper."
+        ),
+    ] = "balanced"
     backbone_weights: Annotated[
         Path | None,
         _optional(

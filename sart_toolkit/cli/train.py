@@ -25,6 +25,7 @@ def train_verb(args: Train) -> dict[str, Any]:
         "image_shift": args.image_shift,
         "schedule": args.schedule,
         "norm": args.norm,
+        "weighting": args.weighting,
         "cameras": tuple(args.cameras.split(",")),
         "backbone_weights": args.backbone_weights and str(args.backbone_weights),
         "device": args.device,

@@ -17,7 +17,7 @@ DISTRIBUTIONS = ("paper", "area")
 class SamplingConfig:
     """How poses are drawn: `distribution` of positions, `rotation_per_metre` nu_r [rad/m]."""
 
-    distribution: str = "paper"
+    distribution: str = "area"
     rotation_per_metre: float = ROTATION_PER_METRE
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sart_toolkit.data.dataset import Dataset, count_demonstrations
+from sart_toolkit.data.pace import Pace, travel
 from sart_toolkit.data.records import (
     Demonstration,
+    Image,
     Steps,
     actions_from_commands,
     digest,
@@ -42,6 +45,18 @@ _RELATIVE_FLOOR = 0.1
 _TRANSLATION_FLOOR = 1e-4  # [m]
 _ROTATION_FLOOR = 1e-3  # [rad]
 _GRIPPER_FLOOR = 0.1
+
+WEIGHTINGS = ("balanced", "trajectories")
+# Of the demonstration's pace: a step that moves so far counts fully. And the least that one counts.
+_FULL_PACE, _LEAST_ACTIVITY = 0.5, 0.1
+# What the step counts in which the gripper's command changes: there is one for each grasp.
+_EVENT = 4.0
+# A segment counts fully if its first picture differs from the one that it leads to by this share of
+# what the demonstration's mostly do for as much motion, up to so many steps at its pace. And the
+# least that one counts.
+_TOLD, _TOLD_STEPS, _LEAST_TOLD = 0.5, 5, 0.02
+# In a step, of the gripper's range.
+_COMMAND_CHANGE, _GRIPPER_MOTION = 0.1, 0.02
 
 
 @dataclass(frozen=True)
@@ -81,6 +96,9 @@ class Windows:
     `frames`: each step's images, once. `gripper (F,)` float32: the gripper measured with them.
     `history (U, K)` int64: each window's steps, oldest first. `actions (U, 7)` float32, or
     `(U, chunk, 7)`. `multiplicity (U,)` int64: how many trajectories contribute the window.
+    `activity (U,)` float32: how much happens in it, from 0.1 where the tool stands still to 1 where
+    it moves at half the demonstration's pace, or the gripper moves, and 4 where the gripper's
+    command changes; of a segment times how well pictures tell where it begins, see `_told`.
     `n_trajectories`: how many there are. `data_hash`: SHA-256 over all that training depends on.
     """
 
@@ -89,6 +107,7 @@ class Windows:
     history: Tensor
     actions: Tensor
     multiplicity: Tensor
+    activity: Tensor
     n_trajectories: int
     data_hash: str
 
@@ -101,7 +120,7 @@ class Windows:
         """The same windows, with a copy of all images, in the memory of a device."""
         moved = {
             name: getattr(self, name).to(device)
-            for name in ("frames", "gripper", "history", "actions", "multiplicity")
+            for name in ("frames", "gripper", "history", "actions", "multiplicity", "activity")
         }
         return dataclasses.replace(self, **moved)
 
@@ -124,10 +143,26 @@ class Windows:
         """Say which windows come next, so that the disk has read them by then."""
         self.frames.will_need(self.history[windows])
 
-    def epoch_order(self, rng: np.random.Generator) -> NDArray[np.int64]:
-        """One epoch's windows in random order, each as often as its multiplicity."""
+    def epoch_order(
+        self, rng: np.random.Generator, weighting: str = "balanced"
+    ) -> NDArray[np.int64]:
+        """One epoch's windows in random order: as many as all trajectories have together.
+
+        Args:
+            rng: decides the order, and which of windows that weigh alike come once more.
+            weighting: "trajectories" draws each as often as its multiplicity, so that most of what
+                is learned from is what trajectories share. "balanced" draws each in proportion to
+                the root of its multiplicity, times its activity.
+        """
         multiplicity = self.multiplicity.cpu().numpy()
-        return rng.permutation(np.repeat(np.arange(len(multiplicity)), multiplicity))
+        weights = multiplicity.astype(np.float64)
+        if weighting == "balanced":
+            weights = np.sqrt(weights) * self.activity.cpu().numpy()
+        # Systematic sampling: each count is the expected one, rounded up or down.
+        ends = np.cumsum(weights) * (multiplicity.sum() / weights.sum())
+        ends[-1] = multiplicity.sum()
+        counts = np.diff(np.floor(ends + rng.random()), prepend=0).astype(np.int64)
+        return rng.permutation(np.repeat(np.arange(len(counts)), counts))
 
     def normalisation(self) -> Normalisation:
         """Means and scales over all trajectories.
@@ -243,20 +278,35 @@ def _write(
     check_room(path, n_steps * layout.frame_bytes)
 
     back, ahead = np.arange(-config.history + 1, 1), np.arange(config.chunk)
-    gripper: list[Array] = []
+    gripper = np.empty(n_steps)
     histories: list[NDArray[np.int64]] = []
     chunks: list[NDArray[np.float32]] = []
+    change = 0.0
+    activities: list[Array] = []
+    pace = Pace(dataset.sources[0].demonstration)
     n_written = 0
     sha = hashlib.sha256()
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        for steps, following, actions in _trajectories(dataset, config.cameras):
+    with replacing(path) as temporary, open(temporary, "w+b") as file:
+        for steps, following, actions, joined in _trajectories(dataset, config.cameras):
             packed = layout.pack(steps)
             file.write(packed.data)
             sha.update(packed.data)
-            gripper.append(steps.measured_gripper)
+            gripper[n_written : n_written + len(steps)] = steps.measured_gripper
             sequence = np.concatenate([np.arange(n_written, n_written + len(steps)), following])
             histories.append(sequence[_clipped(len(sequence), back)])
             chunks.append(actions.astype(np.float32)[_clipped(len(sequence), ahead)])
+            activity = _activity(actions, gripper[sequence], pace.step)
+            if joined is not None:
+                file.seek(joined * layout.frame_bytes)
+                goal = np.frombuffer(file.read(layout.frame_bytes), np.uint8)
+                file.seek(0, os.SEEK_END)
+                far = travel(actions[: len(steps)]).sum()
+                activity[: len(steps)] *= _told(
+                    packed[0], goal, min(far, _TOLD_STEPS * pace.step) * change
+                )
+            elif not n_written:
+                change = _change(packed, actions)
+            activities.append(activity)
             n_written += len(steps)
             if progress is not None:
                 progress(len(histories), n_trajectories)
@@ -267,10 +317,11 @@ def _write(
     )
     chunk = np.concatenate(chunks)[chosen]
     arrays = {
-        "gripper": np.concatenate(gripper).astype(np.float32),
+        "gripper": gripper[:n_written].astype(np.float32),
         "history": windows,
         "actions": chunk[:, 0] if config.chunk == 1 else chunk,
         "multiplicity": multiplicity,
+        "activity": np.concatenate(activities)[chosen].astype(np.float32),
     }
     about = {
         "n_trajectories": n_trajectories,
@@ -281,10 +332,11 @@ def _write(
 
 def _trajectories(
     dataset: Dataset, cameras: tuple[str, ...]
-) -> Iterator[tuple[Steps, NDArray[np.int64], Array]]:
+) -> Iterator[tuple[Steps, NDArray[np.int64], Array, int | None]]:
     """For each trajectory its own steps, the numbers of those that follow them, and its actions.
 
-    Steps are numbered as they are yielded: an episode's are followed by its demonstration's.
+    And of a segment the number of the step at t*. Steps are numbered as they are yielded: an
+    episode's are followed by its demonstration's.
     """
     # Sources may share a demonstration, which is learned from once.
     demonstrations: dict[str, tuple[Demonstration, int, Array]] = {}
@@ -296,7 +348,7 @@ def _trajectories(
         demonstration, actions = source.demonstration, source.demonstration.actions
         _check_same_cameras(source.name, demonstration.steps, reference, cameras)
         demonstrations[source.demonstration_hash] = demonstration, n_yielded, actions
-        yield demonstration.steps, np.arange(0), actions
+        yield demonstration.steps, np.arange(0), actions, None
         n_yielded += len(demonstration)
     for i, episode in enumerate(dataset):
         t_star = episode.provenance.t_star
@@ -314,7 +366,49 @@ def _trajectories(
         own_actions = actions_from_commands(commanded[: n + 1], gripper[: n + 1])[:n]
         # Where it isn't merged, the step that it leads to has no action of its own to learn.
         after = np.arange(t_star, len(demonstration) if episode.provenance.merged else t_star)
-        yield episode.steps, first + after, np.concatenate([own_actions, actions[after]])
+        yield (
+            episode.steps,
+            first + after,
+            np.concatenate([own_actions, actions[after]]),
+            first + t_star,
+        )
+
+
+def _activity(actions: Array, gripper: Array, pace: float) -> Array:
+    """How much happens `(n,)` in a trajectory's steps, see `Windows`.
+
+    What stands still looks alike whatever comes next. Were waiting steps to count as much as
+    others, a policy would learn to go on waiting.
+    """
+    activity = np.clip(travel(actions[:, :6]) / (_FULL_PACE * pace), _LEAST_ACTIVITY, 1.0)
+    turned = np.abs(np.diff(gripper)) > _GRIPPER_MOTION
+    activity[np.append(turned, False) | np.append(False, turned)] = 1.0
+    activity[1:][np.abs(np.diff(actions[:, 6])) > _COMMAND_CHANGE] = _EVENT
+    return activity
+
+
+def _change(packed: Image, actions: Array) -> float:
+    """How much a demonstration's pictures change [of 255] a metre, as `travel` counts it."""
+    changes = np.abs(np.diff(packed.astype(np.int16), axis=0)).mean(1)
+    return float(changes.sum() / max(travel(actions).sum(), 1e-9))
+
+
+def _told(first: Image, goal: Image, usual: float) -> float:
+    """How well (0 to 1) a picture tells where a segment begins from where it leads to.
+
+    Where all that a camera sees is in the grasp, pictures hardly change. Segments there lead every
+    which way from what looks alike; counted fully they keep a policy from doing what the
+    demonstration did.
+
+    Args:
+        first: the packed picture of the segment's first step.
+        goal: that of the demonstration's step at t*.
+        usual: the change [of 255] that is to be expected.
+    """
+    if not usual > 0:
+        return 1.0
+    seen = np.abs(first.astype(np.int16) - goal).mean()
+    return max(_LEAST_TOLD, min(1.0, float(seen / (_TOLD * usual))) ** 2)
 
 
 def _clipped(n: int, around: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -29,7 +29,7 @@ from sart_toolkit.data.storage import (
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
 from sart_toolkit.learn.policies import POLICIES, get_policy
 from sart_toolkit.learn.policy import Policy, PolicySetup
-from sart_toolkit.learn.samples import WindowConfig, Windows, open_windows
+from sart_toolkit.learn.samples import WEIGHTINGS, WindowConfig, Windows, open_windows
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.poses import check_positive
 from sart_toolkit.registry import lasting_reference
@@ -51,7 +51,8 @@ class TrainConfig:
     `weight_decay`; `schedule` is "cosine" (5 % linear warm-up, then down to 0) or "constant".
     `history` images of each of `cameras`, resized to a height of `image_size` [pixels]; each window
     shifted by up to `image_shift` pixels at random. `hidden`: width of the head. `norm`: the
-    policy's normalisation layers. `backbone_weights`: a file of weights to start from. `bfloat16`:
+    policy's normalisation layers. `weighting`: which windows an epoch draws how often, see
+    `Windows.epoch_order`. `backbone_weights`: a file of weights to start from. `bfloat16`:
     "auto", "on" or "off". `device`: "auto", "cpu" or "cuda". `threads`: torch's threads, its own
     choice if None. `seed` decides the initial weights, the order and the shifts. `policy` may be
     given as a class; its reference is kept.
@@ -68,6 +69,7 @@ class TrainConfig:
     norm: str
     history: int = 2
     hidden: int = 512
+    weighting: str = "balanced"
     cameras: tuple[str, ...] = ("wrist",)
     backbone_weights: str | None = None
     bfloat16: str = "auto"
@@ -107,6 +109,7 @@ class TrainConfig:
             ("bfloat16", ("auto", "on", "off")),
             ("device", ("auto", "cpu", "cuda")),
             ("norm", norms),
+            ("weighting", WEIGHTINGS),
         ):
             if getattr(self, name) not in choices:
                 raise InvalidInput(
@@ -373,7 +376,7 @@ class _Training:
 
     def _epoch_batches(self, epoch: int) -> list[tuple[Tensor, Tensor]]:
         rng = np.random.default_rng([self.config.seed, epoch])
-        order = self.windows.epoch_order(rng)
+        order = self.windows.epoch_order(rng, self.config.weighting)
         offsets = rng.integers(0, 2 * self.config.image_shift + 1, (len(order), 2))
         device = self.windows.device
         # Batches that differ by at most one window: a small last batch would disturb BatchNorm.

@@ -124,17 +124,41 @@ def test_suggested_spheres_start_at_waypoint_0_and_tile_the_free_part(
         np.testing.assert_array_equal(
             sphere.T_world_key, d.steps.measured_Ts_world_tool[sphere.waypoint]
         )
-    for sphere, following in zip(spheres, spheres[1:], strict=False):
-        assert following.waypoint >= convergence_waypoint(d, sphere)
     assert peg_annotation.settings == dataclasses.asdict(config)
 
 
-def test_between_two_spheres_no_waypoint_has_room(peg_demonstration, peg_world, peg_annotation):
+def radius_at(demonstration, world, t):
+    return suggest_radius(world, demonstration, t).radius
+
+
+def test_suggested_spheres_shrink_step_by_step(peg_demonstration, peg_world, peg_annotation):
+    """Between far away and touching there is something to correct with, and no more than needed."""
     spheres = peg_annotation.spheres
+    assert spheres[0].radius > 8 * min(sphere.radius for sphere in spheres)
     for sphere, following in zip(spheres, spheres[1:], strict=False):
-        for t in range(convergence_waypoint(peg_demonstration, sphere), following.waypoint):
-            with pytest.raises(InvalidInput, match="no room"):
-                suggested(peg_demonstration, peg_world, [t])
+        ahead = convergence_waypoint(peg_demonstration, sphere)
+        radii = {
+            t: radius_at(peg_demonstration, peg_world, t)
+            for t in range(sphere.waypoint + 1, max(ahead, following.waypoint) + 1)
+        }
+        wide = [t for t in range(sphere.waypoint + 1, ahead + 1) if radii[t] >= sphere.radius / 2]
+        if wide:
+            assert following.waypoint == wide[-1]
+        else:
+            # The first that has room at all.
+            between = range(sphere.waypoint + 1, following.waypoint)
+            assert all(radii[t] < SuggestConfig().min_radius for t in between)
+
+
+def test_a_funnel_may_be_steeper(peg_demonstration, peg_world, peg_annotation):
+    steep = SuggestConfig(shrink=1e9)
+    spheres = suggest_annotation(peg_demonstration, peg_world, config=steep).spheres
+    assert len(spheres) < len(peg_annotation.spheres)
+    for sphere, following in zip(spheres, spheres[1:], strict=False):
+        ahead = convergence_waypoint(peg_demonstration, sphere)
+        assert following.waypoint >= ahead
+        for t in range(ahead, following.waypoint):
+            assert radius_at(peg_demonstration, peg_world, t) < steep.min_radius
 
 
 def test_suggested_lengths_are_whole_micrometres(peg_annotation):
@@ -303,6 +327,8 @@ def test_where_no_waypoint_has_room_the_error_says_what_to_do(peg_world, peg_dem
         ({"rotation_per_metre": -1.0}, "rotation_per_metre: expected"),
         ({"rotation_per_metre": np.nan}, "rotation_per_metre: expected"),
         ({"rotation_per_metre": np.inf}, "rotation_per_metre: expected"),
+        ({"shrink": 1.0}, "shrink: expected a factor above 1, got 1.0"),
+        ({"shrink": np.nan}, "shrink: expected a factor above 1, got nan"),
         ({"probes": 0}, "probes: expected at least 1"),
     ],
 )

@@ -28,6 +28,7 @@ from sart_toolkit.collision.phases import BODY_STILLNESS
 from sart_toolkit.data import writer
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.manifest import KEPT, AttemptKey
+from sart_toolkit.data.pace import Pace
 from sart_toolkit.data.records import (
     Annotation,
     PrecisionSphere,
@@ -172,7 +173,21 @@ def test_by_the_paper_s_strategy_an_episode_starts_on_its_sphere_and_joins_at_t_
         offset = p.T_world_sampled[:3, 3] - sphere.T_world_key[:3, 3]
         assert np.linalg.norm(offset) == pytest.approx(sphere.radius, abs=1e-12)
         assert p.t_star == convergence_waypoint(peg_dataset.sources[0].demonstration, sphere)
-        assert len(episode) == 20, "two seconds at 10 Hz"
+
+
+def test_a_segment_takes_as_long_as_the_demonstration_for_as_much_motion(
+    peg_dataset, peg_world, peg_annotation
+):
+    pace = Pace(peg_world.demonstration)
+    lengths = set()
+    for episode in peg_dataset:
+        p = episode.provenance
+        seconds = np.clip(pace.time_for(p.t_star, p.T_world_sampled), 0.4, 2.0)
+        assert len(episode) == np.ceil(np.round(seconds * 10, 6))
+        lengths.add(len(episode))
+    assert len(lengths) > 1
+    planner = SegmentPlanner(peg_world, peg_annotation, AugmentConfig(duration=1.23))
+    assert planner.duration(planner.proposal(0, 0)[0]) == 1.3
 
 
 def test_the_measured_tool_follows_the_commands_and_the_join_is_smooth(strategy_dataset):
@@ -320,8 +335,7 @@ def test_joint_velocities_of_an_episode_are_those_of_its_own_motion(peg_dataset)
     for episode in peg_dataset:
         q, dq = episode.steps.joint_positions, episode.steps.joint_velocities
         moved = np.diff(q, axis=0)
-        fast = np.abs(moved) > 0.02
-        assert fast.any()
+        fast = np.abs(moved) > 0.5 * np.abs(moved).max()
         np.testing.assert_array_equal(np.sign(moved)[fast], np.sign(dq[1:])[fast])
 
 
@@ -551,7 +565,7 @@ def test_an_episode_s_certificates_say_what_is_proved(peg_dataset, peg_world, pe
     planner = SegmentPlanner(peg_world, peg_annotation, AugmentConfig())
     for episode in peg_dataset:
         proof = episode.provenance.certificate
-        assert proof["duration"] == 2.0
+        assert proof["duration"] == len(episode) / 10
         assert proof["commanded"]["verdict"] == proof["measured"]["verdict"] == "free"
         assert (
             proof["commanded"]["clearance"]
@@ -566,7 +580,7 @@ def test_an_episode_s_certificates_say_what_is_proved(peg_dataset, peg_world, pe
         assert proof["body_stillness"] == BODY_STILLNESS
         assert 0 <= proof["deviation"] <= proof["tracking_error"] == PyBulletBackend.tracking_error
         before = planner.approach(episode.provenance.t_star)
-        assert len(episode.joint_path) == len(before) + 2 * 240
+        assert len(episode.joint_path) == len(before) + 24 * len(episode)
         np.testing.assert_allclose(episode.joint_path[len(before) - 1], before[-1], atol=1e-4)
 
 

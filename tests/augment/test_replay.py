@@ -317,12 +317,12 @@ def test_a_waypoint_that_does_not_reproduce_is_given_up_after_three_arrivals(
     monkeypatch.setattr(peg_backend, "scene", with_loose_block(peg_backend.scene))
     demonstration = dataclasses.replace(peg_demonstration, body_Ts_world=bodies)
     with caplog.at_level(logging.WARNING):
-        made = attempts(demonstration=demonstration, spheres=(0, 2))
+        made = attempts(demonstration=demonstration, spheres=(0, 6))
     assert [a.outcome for a in made[:2]] == ["kept", "kept"]
     given_up = made[2:]
     # The two that were wanted, and all their spares, for which the robot doesn't move.
     assert {a.key.k for a in given_up} == set(range(5))
-    assert all(a.key.sphere == 2 for a in given_up)
+    assert all(a.key.sphere == 6 for a in given_up)
     assert {a.outcome for a in given_up} == {"demonstration doesn't reproduce"}
     assert (
         "3 times something was otherwise at waypoint 29, the last time block was moved: by 2.00"

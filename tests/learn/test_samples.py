@@ -10,7 +10,14 @@ import torch
 from sart_toolkit.data.combine import merge_datasets
 from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import CannotWrite, InvalidInput, Mismatch, UnknownName
-from sart_toolkit.learn.samples import FRAMES, SAMPLES, WindowConfig, open_windows, remove_windows
+from sart_toolkit.learn.samples import (
+    FRAMES,
+    SAMPLES,
+    WEIGHTINGS,
+    WindowConfig,
+    open_windows,
+    remove_windows,
+)
 from sart_toolkit.poses import pose
 
 
@@ -80,11 +87,84 @@ def test_the_shared_suffix_counts_once_for_every_trajectory(dataset, open_window
 
 def test_an_epoch_passes_every_step_of_every_trajectory_once(dataset, open_windows):
     windows = open_windows(dataset)
-    order = windows.epoch_order(np.random.default_rng(0))
+    order = windows.epoch_order(np.random.default_rng(0), "trajectories")
     assert (np.bincount(order) == windows.multiplicity.numpy()).all()
     assert len(order) == 9 + (4 + 6) + 2 * (4 + 4)
-    assert (order != windows.epoch_order(np.random.default_rng(1))).any()
-    assert (order == windows.epoch_order(np.random.default_rng(0))).all()
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+def test_an_epoch_s_order_is_decided_by_its_random_numbers(dataset, open_windows, weighting):
+    windows = open_windows(dataset)
+    order = windows.epoch_order(np.random.default_rng(0), weighting)
+    assert (order != windows.epoch_order(np.random.default_rng(1), weighting)).any()
+    assert (order == windows.epoch_order(np.random.default_rng(0), weighting)).all()
+
+
+def test_a_balanced_epoch_draws_by_the_root_of_multiplicity_and_by_activity(dataset, open_windows):
+    windows = open_windows(dataset)
+    windows = dataclasses.replace(windows, activity=torch.linspace(0.1, 4.0, len(windows.activity)))
+    n = int(windows.multiplicity.sum())
+    weights = np.sqrt(windows.multiplicity.numpy()) * windows.activity.numpy()
+    expected = n * weights / weights.sum()
+    total = np.zeros(len(expected))
+    for seed in range(200):
+        order = windows.epoch_order(np.random.default_rng(seed), "balanced")
+        counts = np.bincount(order, minlength=len(expected))
+        assert len(order) == n and (np.abs(counts - expected) < 1).all()
+        total += counts
+    np.testing.assert_allclose(total / 200, expected, atol=0.15)
+
+
+def test_what_stands_still_counts_less_and_gripper_events_more(
+    make_dataset, with_steps, open_windows
+):
+    """The demonstration moves, waits, and closes its gripper at step 5, which takes two steps."""
+
+    def acted(steps):
+        n = len(steps)
+        along = np.concatenate([[0.0], np.cumsum([0.01] * 3 + [0.0] * (n - 4))])
+        commanded = np.zeros(n)
+        commanded[6:] = 1.0
+        measured = np.zeros(n)
+        measured[7:] = [0.5, 1.0][: max(0, n - 7)]
+        return dataclasses.replace(
+            steps,
+            commanded_Ts_world_tool=np.stack([pose([x, 0, 0]) for x in along]),
+            commanded_gripper=commanded,
+            measured_gripper=measured,
+        )
+
+    windows = open_windows(with_steps(make_dataset(()), acted))
+    at = windows.history[:, -1].numpy()
+    assert windows.activity[np.argsort(at)].tolist() == pytest.approx(
+        [1, 1, 1, 0.1, 0.1, 4, 1, 1, 1]
+    )
+
+
+@pytest.mark.parametrize(("shade", "told"), [(61, 0.02), (68, 0.16), (80, 1.0), (200, 1.0)])
+def test_a_segment_whose_pictures_do_not_tell_where_it_begins_hardly_counts(
+    make_dataset, with_steps, open_windows, shade, told
+):
+    """The demonstration moves 10 mm a step and its pictures change by 20; t* = 3, at shade 60."""
+
+    def acted(steps):
+        n = len(steps)
+        shades = 20 * np.arange(n) if n == 9 else np.full(n, shade)
+        rgb = np.broadcast_to(shades[:, None, None, None], (n, 32, 32, 3)).astype(np.uint8)
+        # A segment of 20 mm in 4 steps.
+        along = 0.01 * np.arange(n) if n == 9 else 0.03 - 0.005 * np.arange(n, 0, -1)
+        camera = dataclasses.replace(steps.cameras["wrist"], rgb=rgb)
+        return dataclasses.replace(
+            steps,
+            cameras={"wrist": camera},
+            commanded_Ts_world_tool=np.stack([pose([x, 0, 0]) for x in along]),
+            commanded_gripper=np.zeros(n),
+            measured_gripper=np.zeros(n),
+        )
+
+    windows = open_windows(with_steps(make_dataset((3,)), acted))
+    segment = windows.activity[(windows.history[:, -1] >= 9)].tolist()
+    assert segment == pytest.approx([told] * 4)
 
 
 def test_joints_forces_and_measured_poses_never_enter(dataset, perturbed, with_steps, open_windows):

@@ -16,6 +16,7 @@ import msgspec
 from sart_toolkit.errors import BrokenFile, InvalidInput, MissingFile, unknown_name
 
 PLANS = (
+    "success",
     "table1",
     "scaling",
     "ablation",

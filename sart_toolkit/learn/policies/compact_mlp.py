@@ -62,7 +62,7 @@ class CompactMLP(MLPPolicy):
 
     encoder: ClassVar[type[Encoder]] = CompactEncoder
     train_defaults: ClassVar[Mapping[str, Any]] = {
-        "epochs": 100,
+        "epochs": 60,
         "batch_size": 128,
         "lr": 2e-3,
         "weight_decay": 1e-4,
