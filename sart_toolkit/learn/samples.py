@@ -47,8 +47,9 @@ _ROTATION_FLOOR = 1e-3  # [rad]
 _GRIPPER_FLOOR = 0.1
 
 WEIGHTINGS = ("balanced", "trajectories")
-# Of the demonstration's pace: a step that moves so far counts fully. And the least that one counts.
-_FULL_PACE, _LEAST_ACTIVITY = 0.5, 0.1
+# A step counts fully where the tool gets on by this share of the demonstration's pace, over so many
+# steps; where it is slower, as the square. And the least that one counts.
+_FULL_PACE, _SEVERAL, _LEAST_ACTIVITY = 0.35, 4, 0.02
 # What the step counts in which the gripper's command changes: there is one for each grasp.
 _EVENT = 4.0
 # A segment counts fully if its first picture differs from the one that it leads to by this share of
@@ -96,9 +97,10 @@ class Windows:
     `frames`: each step's images, once. `gripper (F,)` float32: the gripper measured with them.
     `history (U, K)` int64: each window's steps, oldest first. `actions (U, 7)` float32, or
     `(U, chunk, 7)`. `multiplicity (U,)` int64: how many trajectories contribute the window.
-    `activity (U,)` float32: how much happens in it, from 0.1 where the tool stands still to 1 where
-    it moves at half the demonstration's pace, or the gripper moves, and 4 where the gripper's
-    command changes; of a segment times how well pictures tell where it begins, see `_told`.
+    `activity (U,)` float32: how much happens in it, from 0.02 where the tool stands still to 1
+    where it gets on at a third of the demonstration's pace, or the gripper moves, and 4 where the
+    gripper's command changes; of a segment times how well pictures tell where it begins, see
+    `_told`.
     `n_trajectories`: how many there are. `data_hash`: SHA-256 over all that training depends on.
     """
 
@@ -378,11 +380,17 @@ def _activity(actions: Array, gripper: Array, pace: float) -> Array:
     """How much happens `(n,)` in a trajectory's steps, see `Windows`.
 
     What stands still looks alike whatever comes next. Were waiting steps to count as much as
-    others, a policy would learn to go on waiting.
+    others, a policy would learn to go on waiting. A hand trembles while it waits, so what counts is
+    how far the tool gets in several steps, those that come or those that were.
     """
-    activity = np.clip(travel(actions[:, :6]) / (_FULL_PACE * pace), _LEAST_ACTIVITY, 1.0)
-    turned = np.abs(np.diff(gripper)) > _GRIPPER_MOTION
-    activity[np.append(turned, False) | np.append(False, turned)] = 1.0
+    along = np.cumsum(np.vstack([np.zeros(6), actions[:, :6]]), axis=0)
+    at, n = np.arange(len(actions)), len(actions)
+    to, since = np.minimum(at + _SEVERAL, n), np.maximum(at + 1 - _SEVERAL, 0)
+    coming = travel(along[to] - along[at]) / (to - at)
+    gone = travel(along[at + 1] - along[since]) / (at + 1 - since)
+    share = np.maximum(coming, gone) / (_FULL_PACE * pace)
+    activity = np.clip(share**2, _LEAST_ACTIVITY, 1.0)
+    activity[:-1][np.abs(np.diff(gripper)) > _GRIPPER_MOTION] = 1.0
     activity[1:][np.abs(np.diff(actions[:, 6])) > _COMMAND_CHANGE] = _EVENT
     return activity
 

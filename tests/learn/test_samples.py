@@ -118,27 +118,30 @@ def test_a_balanced_epoch_draws_by_the_root_of_multiplicity_and_by_activity(data
 def test_what_stands_still_counts_less_and_gripper_events_more(
     make_dataset, with_steps, open_windows
 ):
-    """The demonstration moves, waits, and closes its gripper at step 5, which takes two steps."""
+    """It moves 10 mm a step, trembles from step 8 on, closes its gripper at 17, moves from 26."""
 
     def acted(steps):
         n = len(steps)
-        along = np.concatenate([[0.0], np.cumsum([0.01] * 3 + [0.0] * (n - 4))])
-        commanded = np.zeros(n)
-        commanded[6:] = 1.0
-        measured = np.zeros(n)
-        measured[7:] = [0.5, 1.0][: max(0, n - 7)]
+        strides = np.zeros(n)
+        strides[1:9] = strides[27:] = 0.01
+        strides[9:27] = 0.003 * (-1.0) ** np.arange(18)
+        commanded = np.where(np.arange(n) >= 18, 1.0, 0.0)
+        measured = np.clip((np.arange(n) - 17) / 2, 0.0, 1.0)
         return dataclasses.replace(
             steps,
-            commanded_Ts_world_tool=np.stack([pose([x, 0, 0]) for x in along]),
+            commanded_Ts_world_tool=np.stack([pose([x, 0, 0]) for x in np.cumsum(strides)]),
             commanded_gripper=commanded,
             measured_gripper=measured,
         )
 
-    windows = open_windows(with_steps(make_dataset(()), acted))
-    at = windows.history[:, -1].numpy()
-    assert windows.activity[np.argsort(at)].tolist() == pytest.approx(
-        [1, 1, 1, 0.1, 0.1, 4, 1, 1, 1]
-    )
+    windows = open_windows(with_steps(make_dataset((), n=34), acted))
+    activity = windows.activity[np.argsort(windows.history[:, -1].numpy())].numpy()
+    assert (activity[:8] == 1).all() and (activity[26:33] == 1).all()
+    # The tremor gets nowhere in four steps; what comes or was within four counts.
+    assert activity[12:17] == pytest.approx(0.02)
+    assert activity[17] == 4 and activity[18] == 1
+    assert activity[19:22] == pytest.approx(0.02)
+    assert (np.diff(activity[22:26]) > 0).any() and activity[24] == 1
 
 
 @pytest.mark.parametrize(("shade", "told"), [(61, 0.02), (68, 0.16), (80, 1.0), (200, 1.0)])
