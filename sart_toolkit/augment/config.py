@@ -20,7 +20,7 @@ from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import check_positive
 from sart_toolkit.registry import lasting_reference
 
-ALLOCATIONS = ("radius", "equal")
+ALLOCATIONS = ("root", "radius", "equal")
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class AugmentConfig:
     """What to generate.
 
     `n`: trajectories in all, the demonstrations among them; the others are allocated to the spheres
-    (see `allocate`) weighted by radius, or with `allocation` "equal" all the same, as in the paper.
+    (see `allocate`) weighted by the root of the radius, or with `allocation` "radius" by that itself,
+    or with "equal" all the same, as in the paper.
     `duration` [s] is the paper's delta (2 s), the least that a segment takes, rounded up to whole
     recorded steps; `None`: as long as the demonstration takes for as much motion near the waypoint,
     from 0.4 to 2 s. Every segment is proved to keep `margin` [m] free of the `obstacles`, the
@@ -44,7 +45,7 @@ class AugmentConfig:
     """
 
     n: int = 40
-    allocation: str = "radius"
+    allocation: str = "root"
     strategy: str | Strategy = "sart"
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     duration: float | None = None

@@ -86,11 +86,10 @@ class Strategy(abc.ABC):
 
         Args:
             spheres: those of all demonstrations.
-            allocation: "radius" or "equal", as `AugmentConfig` has it.
+            allocation: "root", "radius" or "equal", as `AugmentConfig` has it.
         """
-        if allocation == "equal":
-            return np.ones(len(spheres))
-        return np.array([sphere.radius for sphere in spheres])
+        exponent = {"root": 0.5, "radius": 1.0, "equal": 0.0}[allocation]
+        return np.array([sphere.radius for sphere in spheres]) ** exponent
 
     @abc.abstractmethod
     def propose(

@@ -418,9 +418,12 @@ class Augment:
     backend: _NOTED_BACKEND = None
     strategy: _STRATEGY = "sart"
     allocation: Annotated[
-        Literal["radius", "equal"],
-        arg(help="Allocation of trajectories to spheres: by radius, or equally as in the paper."),
-    ] = "radius"
+        Literal["root", "radius", "equal"],
+        arg(
+            help="Allocation of trajectories to spheres: by the root of the radius, by the radius, "
+            "or equally as in the paper."
+        ),
+    ] = "root"
     distribution: _DISTRIBUTION = "area"
     rotation_per_metre: Annotated[
         float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")

@@ -49,7 +49,7 @@ _GRIPPER_FLOOR = 0.1
 WEIGHTINGS = ("balanced", "trajectories")
 # A step counts fully where the tool gets on by this share of the demonstration's pace, over so many
 # steps; where it is slower, as the square. And the least that one counts.
-_FULL_PACE, _SEVERAL, _LEAST_ACTIVITY = 0.35, 4, 0.02
+_FULL_PACE, _SEVERAL, _LEAST_ACTIVITY = 0.35, 4, 0.1
 # What the step counts in which the gripper's command changes: there is one for each grasp.
 _EVENT = 4.0
 # A segment counts fully if its first picture differs from the one that it leads to by this share of
@@ -97,7 +97,7 @@ class Windows:
     `frames`: each step's images, once. `gripper (F,)` float32: the gripper measured with them.
     `history (U, K)` int64: each window's steps, oldest first. `actions (U, 7)` float32, or
     `(U, chunk, 7)`. `multiplicity (U,)` int64: how many trajectories contribute the window.
-    `activity (U,)` float32: how much happens in it, from 0.02 where the tool stands still to 1
+    `activity (U,)` float32: how much happens in it, from 0.1 where the tool stands still to 1
     where it gets on at a third of the demonstration's pace, or the gripper moves, and 4 where the
     gripper's command changes; of a segment times how well pictures tell where it begins, see
     `_told`.
