@@ -28,8 +28,8 @@ class AugmentConfig:
     """What to generate.
 
     `n`: trajectories in all, the demonstrations among them; the others are allocated to the spheres
-    (see `allocate`) weighted by the root of the radius, or with `allocation` "radius" by that itself,
-    or with "equal" all the same, as in the paper.
+    (see `allocate`) weighted by the root of the radius, with `allocation` "radius" by the radius, or
+    with "equal" all the same, as in the paper.
     `duration` [s] is the paper's delta (2 s), the least that a segment takes, rounded up to whole
     recorded steps; `None`: as long as the demonstration takes for as much motion near the waypoint,
     from 0.4 to 2 s. Every segment is proved to keep `margin` [m] free of the `obstacles`, the
