@@ -28,19 +28,19 @@ class AugmentConfig:
     """What to generate.
 
     `n`: trajectories in all, the demonstrations among them; the others are allocated to the spheres
-    (see `allocate`) weighted by the root of the radius, with `allocation` "radius" by the radius, or
-    with "equal" all the same, as in the paper.
-    `duration` [s] is the paper's delta (2 s), the least that a segment takes, rounded up to whole
-    recorded steps; `None`: as long as the demonstration takes for as much motion near the waypoint,
-    from 0.4 to 2 s. Every segment is proved to keep `margin` [m] free of the `obstacles`, the
-    bodies of the scene or the cloud that the demonstration's cameras saw (made as `cloud` says): as
-    measured, even if what is grasped has slipped by `slip_tolerance` [m] and bodies have moved by
-    `BODY_STILLNESS`; as commanded, even if the robot is off its path by its backend's
-    `tracking_error` besides. A segment on which any of these was exceeded is rejected. `cameras`:
-    whose images are recorded, `None` for those of the demonstration. `execution`: how segments are
-    executed, "auto" for whichever executor the backend and the demonstrations allow. `recording`:
-    "reversed" records the way out and reverses it, as the paper does; "return" records the way
-    back, so that the robot lags behind its commands as it will when a policy acts.
+    (see `allocate`) by the root of their radius, with `allocation` "radius" by the radius itself,
+    with "equal" all alike, as in the paper. `duration` [s] is the paper's delta (2 s), the least
+    that a segment takes, rounded up to whole recorded steps; `None`: as long as the demonstration
+    takes for as much motion near the waypoint, from 0.4 to 2 s. Every segment is proved to keep
+    `margin` [m] free of the `obstacles`, the bodies of the scene or the cloud that the
+    demonstration's cameras saw (made as `cloud` says): as measured, even if what is grasped has
+    slipped by `slip_tolerance` [m] and bodies have moved by `BODY_STILLNESS`; as commanded, even if
+    the robot is off its path by its backend's `tracking_error` besides. A segment on which any of
+    these was exceeded is rejected. `cameras`: whose images are recorded, `None` for those of the
+    demonstration. `execution`: how segments are executed, "auto" for whichever executor the backend
+    and the demonstrations allow. `recording`: "reversed" records the way out and reverses it, as
+    the paper does; "return" records the way back, so that the robot lags behind its commands as it
+    will when a policy acts.
     `strategy` may be given as an object; its reference is kept.
     """
 
