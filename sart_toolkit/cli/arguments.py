@@ -949,9 +949,10 @@ class BenchmarkSkill:
 class Benchmark:
     """Learn and evaluate every cell of a plan, a grid of skills, and show tables with intervals.
 
-    Plans: table1, scaling, ablation, miles_radii, effort, transfer, recordings, placement,
-    robustness, precision; or a TOML file of your own, as docs/benchmarks.md has it. Measurements of
-    the toolkit itself, operator, replay, segments, radii, cloud and skill, have flags of their own.
+    Plans: success, table1, scaling, ablation, miles_radii, effort, transfer, recordings,
+    placement, robustness, precision; or a TOML file of your own, as docs/benchmarks.md has it.
+    Measurements of the toolkit itself, operator, replay, segments, radii, cloud and skill, have
+    flags of their own.
 
     Example: sart benchmark table1 --out runs/table1 --dry-run
 
