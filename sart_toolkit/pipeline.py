@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from sart_toolkit.augment import STRATEGIES
-from sart_toolkit.backends import BACKENDS, get_backend, make_backend
+from sart_toolkit.backends import BACKENDS, get_backend, is_cell, make_backend
 from sart_toolkit.data.dataset import Dataset, load_dataset
 from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.records import (
@@ -119,8 +119,13 @@ def check_names(**references: Any) -> None:
 
     Raises:
         UnknownName: there is no such name, module or file.
+        MissingFile: there is no such file of a cell.
     """
     for kind, reference in references.items():
+        if kind == "backend" and is_cell(reference):
+            if not Path(reference).is_file():
+                raise MissingFile(f"backend {reference}: no such file; check the path")
+            continue
         check_known(kind, reference, _TABLES[kind])
 
 
