@@ -25,12 +25,18 @@ from sart_toolkit.hardware import DRIVERS
 from sart_toolkit.hardware.cell import Cell, load_cell
 from sart_toolkit.hardware.drivers import ArmState, Camera, Clock, Gripper
 from sart_toolkit.hardware.images import as_described
-from sart_toolkit.hardware.link import Inline, Link, OwnProcess
+from sart_toolkit.hardware.link import Inline, Link, OwnProcess, Watching
 from sart_toolkit.hardware.servo import RESUME
 from sart_toolkit.poses import Array
 from sart_toolkit.registry import resolve
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import ImageSize, RobotSpec, check_gripper, check_image_size
+from sart_toolkit.robots.spec import (
+    CameraSpec,
+    ImageSize,
+    RobotSpec,
+    check_gripper,
+    check_image_size,
+)
 from sart_toolkit.scenes.spec import SceneSpec
 
 # So far [m] inside the workspace commands end, so that the arm can brake before its border.
@@ -46,18 +52,23 @@ _T = TypeVar("_T")
 class HardwareBackend(Backend):
     """The robot of a cell, connected as long as this is open; a subclass names its `cell`.
 
-    What is commanded is followed at the cell's `speed_scale`, and time passes as much slower. An
-    observation with images tells all of it as it was when the first of them was taken. Whatever is
+    What is commanded is followed at the cell's `speed_scale`, and time passes as much slower. Joints
+    and tool of an observation with images are those when the first of the images was taken; its
+    `time` is when it was asked for. Whatever is
     wrong with arm, gripper or a camera stops the arm and raises `RobotStopped`; nothing moves then
     until a new backend is made.
 
     Attributes:
-        delays: how old each camera's images were when they were read, by its name, mean [s].
+        cell: what is connected, and what it may do.
+        clock: the time [s] that the drivers tell.
+        moves: whether the robot may move. If not, control isn't even taken over: commands are
+            checked and then have no effect.
     """
 
     name = "hardware"
     cell: Cell
     clock: Clock = staticmethod(time.monotonic)
+    moves = True
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -99,11 +110,13 @@ class HardwareBackend(Backend):
         if gripper is not None:
             parts.gripper = gripper
             self._asked("gripper", gripper.connect)
-        if cell.control.process:
+        if not self.moves:
+            parts.link = Watching(cell, self.clock)
+        elif cell.control.process:
             parts.link = OwnProcess(cell, self.robot, self.scene.held)
         else:
             parts.link = Inline(cell, self._model, self.clock)
-        if gripper is not None:
+        if gripper is not None and self.moves:
             self._asked("gripper", gripper.start)
         first = parts.link.first
         self._history = deque([first])
@@ -119,6 +132,11 @@ class HardwareBackend(Backend):
         self._delays: dict[str, list[float]] = {name: [] for name in parts.cameras}
 
     @property
+    def cameras(self) -> dict[str, CameraSpec]:
+        """The cameras of the cell by name; those of the scene are simulators'."""
+        return {camera.name: camera for camera in self.robot.cameras}
+
+    @property
     def delays(self) -> dict[str, float]:
         return {name: float(np.mean(ages)) for name, ages in self._delays.items() if ages}
 
@@ -127,7 +145,11 @@ class HardwareBackend(Backend):
     ) -> Observation:
         size = self.image_size if image_size is None else check_image_size(image_size)
         self.check_cameras(cameras)
-        views, at = {}, self._history[-1].time
+        # Of a robot that was stopped all that was measured is told; the next step says why.
+        with suppress(RobotStopped):
+            self._remember(self._linked().newest())
+        now = at = self._history[-1].time
+        views = {}
         for i, name in enumerate(cameras):
             image = self._asked(f"camera {name!r}", self._parts.cameras[name].read)
             self._delays[name].append(self.clock() - image.time)
@@ -147,7 +169,7 @@ class HardwareBackend(Backend):
             dq=dq / scale,
             gripper=self._opening,
             T_world_tool=self._model.fk(q),
-            time=(at - self._started) * scale,
+            time=(now - self._started) * scale,
             cameras=views,
             joint_path=np.array([*path, q]),
         )
@@ -198,13 +220,17 @@ class HardwareBackend(Backend):
         if rows is None:
             rows = self._target[None]
         gripper = self._parts.gripper
-        if gripper is not None and self._gripper_target != self._gripper_sent:
+        if gripper is not None and self.moves and self._gripper_target != self._gripper_sent:
             self._asked("gripper", gripper.move, self._gripper_target)
             self._gripper_sent = self._gripper_target
         link = self._linked()
         link.push(rows, 1.0 / self.rates.control_hz)
         self._target = rows[-1]
-        self._take(link.wait(self.cell.control.buffer))
+        states = link.wait(self.cell.control.buffer)
+        self._remember(states)
+        self._force = max((state.force or 0.0 for state in states), default=0.0)
+        if not self.moves:
+            self._target = self._history[-1].q
         if gripper is not None:
             self._opening = self._asked("gripper", gripper.position)
         else:
@@ -217,14 +243,13 @@ class HardwareBackend(Backend):
                     TimeoutError(f"its newest image is {age:.2f} s old; check its cable"),
                 )
 
-    def _take(self, states: Sequence[ArmState]) -> None:
+    def _remember(self, states: Sequence[ArmState]) -> None:
         # A state that was lost on its way is told twice.
         for state in states:
             if state.time > self._history[-1].time:
                 self._history.append(state)
         while self._history[-1].time - self._history[0].time > _REMEMBERED:
             self._history.popleft()
-        self._force = max((state.force or 0.0 for state in states), default=self._force)
 
     def close(self) -> None:
         self._close()
@@ -276,6 +301,11 @@ class ForceHardwareBackend(HardwareBackend, SensesForce):
 
     def force(self) -> float:
         return self._force
+
+
+def without_motion(backend: type[HardwareBackend]) -> type[HardwareBackend]:
+    """The backend of the same cell on which nothing moves."""
+    return type(backend.__name__, (backend,), {"moves": False})
 
 
 def cell_backend(cell: Cell | Path | str) -> type[HardwareBackend]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sart_toolkit.data.records import DepthImage, Image
 from sart_toolkit.errors import InvalidInput
@@ -28,7 +29,7 @@ def as_described(
         InvalidInput: the camera sees less than the image is to show.
     """
     wanted, given = camera.intrinsics(*size), image.intrinsics
-    fine, middle = [], []
+    fine, middle = list[NDArray[np.int_]](), list[NDArray[np.int_]]()
     for axis, (pixels, there) in enumerate(zip(size, image.depth.shape[::-1], strict=True)):
         ratio = given[axis, axis] / wanted[axis, axis]
         samples = int(np.clip(np.ceil(ratio), 1, _MOST_SAMPLES))

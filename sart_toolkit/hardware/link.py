@@ -1,4 +1,4 @@
-"""Who keeps the arm's rate: the caller itself, or a process of its own."""
+"""Who keeps the arm's rate: a process of its own, the caller itself, or nobody."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from typing import Any, Protocol
 
 from sart_toolkit.errors import RobotStopped, SartError
 from sart_toolkit.hardware.cell import Cell
-from sart_toolkit.hardware.drivers import ArmState, Clock
+from sart_toolkit.hardware.drivers import Arm, ArmState, Clock
 from sart_toolkit.hardware.servo import RESUME, Servo
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Attachment, RobotSpec
 
 # How long [s] the process may take to begin, and then to answer.
-_START_TIME, _ANSWER_TIME = 30.0, 0.5
+_START_TIME, _ANSWER_TIME = 60.0, 0.5
 # For so long [s] it remembers what the arm measured, in case nobody asks.
 _REMEMBERED = 10.0
 _NO_ANSWER = (
@@ -43,6 +43,9 @@ class Link(Protocol):
         Returns what the arm measured since this was called before.
         """
 
+    def newest(self) -> Sequence[ArmState]:
+        """What the arm measured since, without waiting; nothing where time stands still."""
+
     def stop(self, reason: str) -> None:
         """Stop the arm for good."""
 
@@ -62,7 +65,7 @@ class Inline:
         arm = cell.make_arm(clock)
         self._servo, self._pushed = Servo(arm, model, cell, clock), 0.0
         try:
-            arm.connect()
+            _connect(arm)
             self.first = self._servo.start()
         except BaseException:
             self._servo.close()
@@ -73,16 +76,59 @@ class Inline:
         self._pushed += seconds
 
     def wait(self, left: float) -> Sequence[ArmState]:
-        states = []
+        states = list[ArmState]()
         while not states or self._pushed - self._servo.consumed > left + 1e-9:
             states.append(self._servo.tick())
         return states
+
+    def newest(self) -> Sequence[ArmState]:
+        return ()
 
     def stop(self, reason: str) -> None:
         self._servo.stop(reason)
 
     def close(self) -> None:
         self._servo.close()
+
+
+class Watching:
+    """An arm that is read and never moved: what is pushed has no effect."""
+
+    def __init__(self, cell: Cell, clock: Clock) -> None:
+        """Connect the arm; control stays where it is."""
+        self._arm, self._clock = cell.make_arm(clock), clock
+        self._speed, self._due = cell.limits.speed_scale, clock()
+        try:
+            _connect(self._arm)
+            self.first = self._read()
+        except BaseException:
+            self.close()
+            raise
+
+    def push(self, targets: Array, seconds: float) -> None:
+        self._due += seconds / self._speed
+
+    def wait(self, left: float) -> Sequence[ArmState]:
+        if (early := self._due - self._clock()) > 0:
+            time.sleep(early)
+        self._due = max(self._due, self._clock())
+        return [self._read()]
+
+    def newest(self) -> Sequence[ArmState]:
+        return [self._read()]
+
+    def stop(self, reason: str) -> None:
+        pass
+
+    def close(self) -> None:
+        with suppress(Exception):
+            self._arm.disconnect()
+
+    def _read(self) -> ArmState:
+        try:
+            return self._arm.read()
+        except Exception as error:
+            raise RobotStopped(f"arm can't be read: {error}; {RESUME}") from error
 
 
 class OwnProcess:
@@ -105,7 +151,7 @@ class OwnProcess:
         )
         self._process.start()
         theirs.close()
-        self._pushed, self._speed = 0.0, cell.limits.speed_scale
+        self._pushed, self._consumed, self._speed = 0.0, 0.0, cell.limits.speed_scale
         try:
             self.first = self._answer(_START_TIME)
         except BaseException:
@@ -119,13 +165,16 @@ class OwnProcess:
     def wait(self, left: float) -> Sequence[ArmState]:
         states: list[ArmState] = []
         while True:
-            self._send("report")
-            consumed, more = self._answer(_ANSWER_TIME)
-            states += more
-            over = self._pushed - consumed - left
+            states += self.newest()
+            over = self._pushed - self._consumed - left
             if states and over <= 1e-9:
                 return states
             time.sleep(max(over, 1e-3) / self._speed)
+
+    def newest(self) -> Sequence[ArmState]:
+        self._send("report")
+        self._consumed, states = self._answer(_ANSWER_TIME)
+        return list(states)
 
     def stop(self, reason: str) -> None:
         with suppress(RobotStopped):
@@ -157,6 +206,17 @@ class OwnProcess:
         return answer
 
 
+def _connect(arm: Arm) -> None:
+    try:
+        arm.connect()
+    except SartError:
+        raise
+    except Exception as error:
+        raise RobotStopped(
+            f"arm can't be connected: {error}; check its address and cable, {RESUME}"
+        ) from error
+
+
 def _serve(cell: Cell, robot: RobotSpec, held: tuple[Attachment, ...], pipe: Connection) -> None:
     """The other process: moves the arm until the pipe is closed."""
 
@@ -171,7 +231,7 @@ def _serve(cell: Cell, robot: RobotSpec, held: tuple[Attachment, ...], pipe: Con
         try:
             arm = cell.make_arm()
             servo = Servo(arm, RobotModel(robot, held), cell, time.monotonic)
-            arm.connect()
+            _connect(arm)
             pipe.send(servo.start())
             _move(servo, pipe, cell.control.rate_hz)
         except SartError as error:

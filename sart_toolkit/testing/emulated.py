@@ -182,7 +182,7 @@ class EmulatedWorld:
             cameras=camera,
             limits=limits or Limits(Workspace(np.full(3, -2.0), np.full(3, 2.0)), speed_scale=1.0),
             control=Control(
-                **{"rate_hz": self.emulation.rate_hz, "process": False, "buffer": 0.0, **control}
+                **{"rate_hz": self.emulation.rate_hz, "process": False, "buffer": 0.02, **control}
             ),
         )
 
@@ -207,7 +207,7 @@ class EmulatedWorld:
         self._target: Array | None = None
         self._watchdog, self._kicked = np.inf, self.time
         self._seen = self._sim.observe()
-        self._pressed = 0.0
+        self._pressed, self._touching = 0.0, frozenset[tuple[str, str]]()
         self._history = deque([(self.time, self._state())])
         self._measure()
 
@@ -216,12 +216,21 @@ class EmulatedWorld:
         assert kind in FAULTS or kind.startswith("raise:"), kind
         self._faults.append(_Fault(kind, time))
 
+    @property
+    def connections(self) -> int:
+        """How many are connected to the gripper."""
+        return self._server.connections
+
+    def forget_faults(self) -> None:
+        """Take back what was injected and hasn't happened yet."""
+        self._faults.clear()
+
     def observe(self) -> Observation:
         """Where robot and bodies really are."""
         return self._sim.observe()
 
     @property
-    def contacts(self) -> set[tuple[str, str]]:
+    def contacts(self) -> frozenset[tuple[str, str]]:
         """Which bodies touched during the last period, of those that should not."""
         return self._touching
 
@@ -566,9 +575,12 @@ class _Server:
         class Handler(socketserver.StreamRequestHandler):
             def handle(self) -> None:
                 connections.add(self.connection)
-                for line in self.rfile:
-                    answer = gripper.answer(line.decode(errors="replace").split())
-                    self.wfile.write(answer.encode())
+                # Whoever is connected may end it at any time.
+                with suppress(OSError):
+                    for line in self.rfile:
+                        answer = gripper.answer(line.decode(errors="replace").split())
+                        self.wfile.write(answer.encode())
+                connections.discard(self.connection)
 
         self._server = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = True
@@ -578,16 +590,20 @@ class _Server:
         self._thread.start()
 
     @property
+    def connections(self) -> int:
+        """How many are connected."""
+        return len(self._connections)
+
+    @property
     def address(self) -> tuple[str, int]:
         host, port = self._server.server_address[:2]
         return str(host), int(port)
 
     def hang_up(self) -> None:
         """Close what is connected."""
-        for connection in self._connections:
+        for connection in list(self._connections):
             with suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
-        self._connections.clear()
 
     def close(self) -> None:
         self.hang_up()
