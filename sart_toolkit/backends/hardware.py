@@ -52,9 +52,9 @@ _T = TypeVar("_T")
 class HardwareBackend(Backend):
     """The robot of a cell, connected as long as this is open; a subclass names its `cell`.
 
-    What is commanded is followed at the cell's `speed_scale`, and time passes as much slower. Joints
-    and tool of an observation with images are those when the first of the images was taken; its
-    `time` is when it was asked for. Whatever is
+    What is commanded is followed at the cell's `speed_scale`, and time passes as much slower.
+    Joints and tool of an observation with images are those when the first of the images was taken;
+    its `time` is when it was asked for. Whatever is
     wrong with arm, gripper or a camera stops the arm and raises `RobotStopped`; nothing moves then
     until a new backend is made.
 

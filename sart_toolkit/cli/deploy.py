@@ -16,8 +16,8 @@ def deploy_verb(args: Deploy) -> dict[str, Any]:
     terminal = sys.stdin.isatty()
     if not (terminal or args.dry_run or args.unattended):
         raise InvalidInput(
-            "deploy: a person beside the robot says when it may move; type it at a terminal, or add "
-            "--unattended or --dry-run"
+            "deploy: a person beside the robot says when it may move; type it at a terminal, or "
+            "add --unattended or --dry-run"
         )
 
     def ready(text: str) -> None:

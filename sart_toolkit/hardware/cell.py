@@ -134,9 +134,9 @@ class Control:
     """How the arm is controlled.
 
     `rate_hz`: how often it is sent targets. `buffer` [s]: so much motion is always sent ahead, so
-    that a late command doesn't slow it down; at least one goal's, see `goal_hz`. `silence` [s]: an arm whose state is older has lost
-    its connection; `camera_silence` [s]: a camera whose newest image is. `process`: whether a
-    process of its own keeps the rate, as it must on hardware.
+    that a late command doesn't slow it down; at least one goal's, see `goal_hz`. `silence` [s]: an
+    arm whose state is older has lost its connection; `camera_silence` [s]: a camera whose newest
+    image is. `process`: whether a process of its own keeps the rate, as it must on hardware.
     """
 
     rate_hz: int = 500
@@ -149,9 +149,7 @@ class Control:
         if isinstance(self.rate_hz, bool) or not 10 <= self.rate_hz <= 1000:
             raise InvalidInput(f"rate_hz: expected 10 to 1000 Hz, got {self.rate_hz}")
         if not 1 / self.goal_hz <= self.buffer <= 1:
-            raise InvalidInput(
-                f"buffer: expected {1 / self.goal_hz:.3f} to 1 s, got {self.buffer}"
-            )
+            raise InvalidInput(f"buffer: expected {1 / self.goal_hz:.3f} to 1 s, got {self.buffer}")
         for name in ("silence", "camera_silence"):
             check_positive(name, getattr(self, name), "s")
 

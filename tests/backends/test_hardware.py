@@ -267,7 +267,7 @@ def test_whichever_call_of_gripper_or_camera_raises_the_arm_is_stopped_and_all_d
         # What fails at the end keeps nobody from ending.
         raise RobotStopped("emulated failure at the end")
     assert raised and ("at the end" in str(info.value)) == (call == "disconnect")
-    called = [each for each in world.calls]
+    called = list(world.calls)
     if any(each.name == "RTDEControlInterface" for each in called):
         stop = next(each for each in called if each.name == "servoStop")
         assert call == "disconnect" or stop.time - raised[0] <= PERIOD

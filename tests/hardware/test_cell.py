@@ -142,7 +142,9 @@ def test_a_camera_that_nobody_places_is_refused(read, robot):
         read(CELL.replace("camera.wrist", "camera.left")).mounted(robot)
 
 
-@pytest.mark.parametrize(("rate", "goal"), [(500, 125), (125, 125), (250, 125), (30, 30), (1000, 125)])
+@pytest.mark.parametrize(
+    ("rate", "goal"), [(500, 125), (125, 125), (250, 125), (30, 30), (1000, 125)]
+)
 def test_goals_come_at_a_part_of_the_rate(read, rate, goal):
     control = read(CELL.replace("rate_hz = 500", f"rate_hz = {rate}")).control
     assert control.goal_hz == goal

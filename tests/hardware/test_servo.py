@@ -125,7 +125,8 @@ def test_a_smooth_motion_is_followed_closely_and_a_little_late(rate_hz):
     run(servo, 2.3)
     late = np.array(arm.sent)
     at = np.arange(1, len(late) + 1) / rate_hz - 2 / 125
-    wanted = np.stack([np.interp(at, [0.0, *times], [h, *c]) for h, c in zip(HOME, rows.T)], 1)
+    through = np.concatenate([HOME[None], rows])
+    wanted = np.stack([np.interp(at, [0.0, *times], joint) for joint in through.T], axis=1)
     assert np.abs(late - wanted).max() < 5e-3
     assert servo.consumed == pytest.approx(2.0)
 
@@ -173,7 +174,10 @@ def test_a_stop_that_fails_still_disconnects():
 @pytest.mark.parametrize(
     ("state", "says"),
     [
-        ({"trouble": "protective stop; clear the way"}, "arm: protective stop; clear the way; then"),
+        (
+            {"trouble": "protective stop; clear the way"},
+            "arm: protective stop; clear the way; then",
+        ),
         ({"force": 51.0}, "51 N at the tool, expected at most 50 N"),
         ({"force": float("nan")}, "nan N at the tool"),
         ({"time": -1.0}, "its state is .* ms old, expected at most 30 ms"),
@@ -216,7 +220,9 @@ def test_a_target_over_a_limit_would_be_refused(monkeypatch):
     arm, servo = make()
     servo.start()
     monkeypatch.setattr(servo, "_next", lambda: HOME + 0.05)
-    with pytest.raises(RobotStopped, match="target refused: velocity of .*_joint is over its limit"):
+    with pytest.raises(
+        RobotStopped, match="target refused: velocity of .*_joint is over its limit"
+    ):
         servo.tick()
     assert arm.sent == []
 
