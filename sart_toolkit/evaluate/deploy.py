@@ -41,6 +41,7 @@ def deploy_skill(
     seconds: float,
     dry_run: bool = False,
     progress: Callable[[float], None] | None = None,
+    reached: Callable[[], bool] | None = None,
 ) -> Deployment:
     """Let a skill act at its rate, within the limits and stops of the backend.
 
@@ -50,6 +51,7 @@ def deploy_skill(
         seconds: for how long, at most, of the skill's own time.
         dry_run: whether its decisions are made and not carried out.
         progress: called with the seconds done.
+        reached: asked after each step whether the goal is reached, which ends it.
 
     Raises:
         InvalidInput: `seconds` is not positive, or the backend's control rate is no multiple of the
@@ -91,6 +93,8 @@ def deploy_skill(
         farthest = max(farthest, float(np.linalg.norm(away)))
         if progress is not None:
             progress(len(decisions) / record_hz)
+        if ended == "time is up" and reached is not None and reached():
+            ended = "goal reached"
         if ended != "time is up":
             break
     return Deployment(

@@ -76,6 +76,12 @@ def test_it_ends_at_the_border_of_the_workspace_or_out_of_reach(make):
     assert done.ended.startswith("steered out of reach: ")
 
 
+def test_it_ends_where_somebody_says_that_the_goal_is_reached(make):
+    backend, skill = make(), Upwards()
+    done = deploy_skill(skill, backend, 5.0, reached=lambda: len(skill.seen) == 3)
+    assert (done.steps, done.ended) == (3, "goal reached")
+
+
 def test_no_time_at_all_is_refused(make):
     with pytest.raises(InvalidInput, match="seconds: expected a finite number > 0 s, got 0"):
         deploy_skill(Upwards(), None, 0.0)
