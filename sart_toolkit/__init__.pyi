@@ -30,6 +30,12 @@ from .backends import (
 from .backends import (
     make_backend as make_backend,
 )
+from .backends.hardware import (
+    HardwareBackend as HardwareBackend,
+)
+from .backends.hardware import (
+    cell_backend as cell_backend,
+)
 from .backends.interface import (
     Backend as Backend,
 )
@@ -190,6 +196,9 @@ from .errors import (
     OutputExists as OutputExists,
 )
 from .errors import (
+    RobotStopped as RobotStopped,
+)
+from .errors import (
     SartError as SartError,
 )
 from .errors import (
@@ -199,6 +208,8 @@ from .errors import (
     Unreachable as Unreachable,
 )
 from .evaluate.compare import compare_rollouts as compare_rollouts
+from .evaluate.deploy import Deployment as Deployment
+from .evaluate.deploy import deploy_skill as deploy_skill
 from .evaluate.rollout import (
     EvaluateConfig as EvaluateConfig,
 )
@@ -211,6 +222,10 @@ from .evaluate.rollout import (
 from .evaluate.rollout import (
     run_rollout as run_rollout,
 )
+from .hardware.cell import Cell as Cell
+from .hardware.cell import load_cell as load_cell
+from .hardware.drivers import ArmState as ArmState
+from .hardware.drivers import CameraImage as CameraImage
 from .learn.policies import POLICIES as POLICIES
 from .learn.policies import get_policy as get_policy
 from .learn.policy import Policy as Policy

@@ -58,6 +58,10 @@ class DeviceLost(SartError, ConnectionError):
     """What a person steers with isn't there, or no longer answers."""
 
 
+class RobotStopped(SartError, RuntimeError):
+    """A real robot stands still, by itself or because something was wrong; the message says why."""
+
+
 class Discarded(SartError, RuntimeError):
     """A person threw away what they had made; nothing was written."""
 

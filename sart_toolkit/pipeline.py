@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from sart_toolkit.augment import STRATEGIES
-from sart_toolkit.backends import BACKENDS, get_backend, make_backend
+from sart_toolkit.backends import BACKENDS, get_backend, is_cell, make_backend
 from sart_toolkit.data.dataset import Dataset, load_dataset
 from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.records import (
@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
     from sart_toolkit.collision.world import CollisionWorld
     from sart_toolkit.data.formats.format import Format, Given
+    from sart_toolkit.evaluate.deploy import Deployment
     from sart_toolkit.evaluate.rollout import Film, Rollout
     from sart_toolkit.learn.policy import Policy
     from sart_toolkit.learn.skill import SkillConfig
@@ -119,8 +120,13 @@ def check_names(**references: Any) -> None:
 
     Raises:
         UnknownName: there is no such name, module or file.
+        MissingFile: there is no such file of a cell.
     """
     for kind, reference in references.items():
+        if kind == "backend" and is_cell(reference):
+            if not Path(reference).is_file():
+                raise MissingFile(f"backend {reference}: no such file; check the path")
+            continue
         check_known(kind, reference, _TABLES[kind])
 
 
@@ -310,6 +316,7 @@ def record(
         InvalidInput: options don't fit each other, a value is not acceptable, or what was recorded
             can't be learned from (`check_recording`).
         Mismatch: the goal was not reached.
+        RobotStopped: a real robot stopped; what was recorded until then is beside `out`.
         OutputExists, CannotWrite: `out` can't be written.
     """
     check_names(task=task, robot=robot, backend=backend, device=device)
@@ -357,14 +364,22 @@ def record(
                 f"--{flag}: is for a device that a person holds; add --device keyboard, say"
             )
         demonstration = record_demonstration(
-            made, found, model, steered, at, seed, config, lambda t: progress("record", t)
-        )
+            made, found, model, steered, at, seed, config, lambda t: progress("record", t),
+            functools.partial(_keep_stopped, out),
+        )  # fmt: skip
     achieved = found.achieved(demonstration.success, demonstration.rates.record_hz)
     if demonstration.judged_by == "task" and not achieved:
         raise Mismatch("the demonstration did not reach the goal; record again with another --seed")
     _check(demonstration, made.robot)
     save_demonstration(out, demonstration)
     return demonstration
+
+
+def _keep_stopped(out: Path, demonstration: Demonstration) -> None:
+    """Save what was recorded until a robot stopped, as `demo.stopped.h5` beside `demo.h5`."""
+    path = out.with_suffix(f".stopped{out.suffix}")
+    save_demonstration(path, demonstration)
+    _log.warning("%d waypoints were recorded until then: %s", len(demonstration), path)
 
 
 def record_several(
@@ -1158,6 +1173,65 @@ def evaluate(
         skill, task_of(about, task), make, config, out, workers, device, report_progress, film,
         overwrite,
     )  # fmt: skip
+
+
+def deploy(
+    skill: Path,
+    *,
+    backend: BackendLike | None = None,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    max_seconds: float | None = None,
+    dry_run: bool = False,
+    device: str = "cpu",
+    ready: Callable[[str], None] | None = None,
+    progress: Progress = _silent,
+) -> Deployment:
+    """What a skill's directory did on a real robot, from where it stands.
+
+    Args:
+        skill: the skill.
+        backend: the cell; the one that the skill notes if left out.
+        task, robot: in place of those that the skill notes.
+        max_seconds: for how long it acts [s]; the task's horizon if left out.
+        dry_run: whether nothing moves: it sees and decides alone.
+        device: where the policy runs.
+        ready: called once all is connected, with what will happen; returns when it may.
+        progress: called with the seconds done.
+
+    Raises:
+        MissingFile, BrokenFile, Mismatch: skill or cell can't be read, or don't fit each other.
+        UnknownName: task, robot or backend can't be found.
+        InvalidInput: the backend is no real robot, or a value is not acceptable.
+        RobotStopped: the robot stopped.
+    """
+    check_names(task=task, robot=robot, backend=backend)
+    if not (skill / "config.json").exists():
+        raise MissingFile(f"{skill}: no such skill directory; make it with `sart train`")
+    from sart_toolkit.backends.hardware import HardwareBackend, without_motion
+    from sart_toolkit.evaluate.deploy import deploy_skill
+    from sart_toolkit.learn.skill import load_skill
+
+    loaded = load_skill(skill, device)
+    about, rates = loaded.config, loaded.demonstration.rates
+    found = _find(about, "backend", backend, get_backend)
+    if not issubclass(found, HardwareBackend):
+        raise InvalidInput(
+            f"backend {found.name!r}: is no real robot; pass a cell's file, or use `sart evaluate`"
+        )
+    goal = task_of(about, task)
+    seconds = goal.horizon if max_seconds is None else max_seconds
+    made_of = without_motion(found) if dry_run else found
+    make = backend_maker(about, _image_size_of_skill(about), rates, goal, robot, made_of)
+    with closing(make()) as made:
+        assert isinstance(made, HardwareBackend)
+        if ready is not None:
+            speed = made.cell.limits.speed_scale
+            what = "nothing moves" if dry_run else f"the robot moves at {speed:.0%} of its speed"
+            ready(f"The skill acts for up to {seconds:g} s of its own time: {what}")
+        return deploy_skill(
+            loaded, made, seconds, dry_run, lambda done: progress("deploy", done, seconds)
+        )
 
 
 def report(run_dir: Path, out: Path | None = None, *, overwrite: bool = False) -> Path:

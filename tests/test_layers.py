@@ -22,6 +22,7 @@ LAYERS = (
     "scenes",
     "collision",
     "motion",
+    "hardware",
     "backends",
     "tasks",
     "record",

@@ -1,12 +1,13 @@
 """Simulators and robots behind one interface (`Backend`).
 
 A new backend is one file and one line in `BACKENDS`; one outside the repository needs no line,
-`package.module:NAME` or `path/to/file.py:NAME` names it.
+`package.module:NAME` or `path/to/file.py:NAME` names it. A real robot is named by the file of its
+cell, `path/to/cell.toml`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.registry import expect_class, resolve
@@ -22,14 +23,24 @@ BACKENDS = {
 }
 
 
+def is_cell(backend: object) -> TypeGuard[str]:
+    """Whether a reference names the file of a cell."""
+    return isinstance(backend, str) and backend.endswith(".toml")
+
+
 def get_backend(backend: str | type[Backend]) -> type[Backend]:
-    """The class that a name or reference names; a class itself is returned.
+    """The class that a name, a reference or a cell's file names; a class itself is returned.
 
     Raises:
         UnknownName: there is none; the message says which part is wrong.
+        MissingFile, BrokenFile, InvalidInput: the cell's file can't be read.
     """
     from sart_toolkit.backends.interface import Backend
 
+    if is_cell(backend):
+        from sart_toolkit.backends.hardware import cell_backend
+
+        return cell_backend(backend)
     return expect_class("backend", backend, resolve("backend", backend, BACKENDS), Backend)
 
 

@@ -118,6 +118,14 @@ class Backend(abc.ABC):
         """The cameras by name: the robot's and the scene's."""
         return {c.name: c for c in (*self.robot.cameras, *self.scene.cameras)}
 
+    @property
+    def delays(self) -> dict[str, float]:
+        """How old [s] each camera's images were, on average, when they arrived, by its name.
+
+        Empty where images are of the moment at which they are asked for.
+        """
+        return {}
+
     def check_cameras(self, names: Sequence[str]) -> None:
         """Return if images of the named cameras can be taken.
 

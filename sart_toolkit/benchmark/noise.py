@@ -37,7 +37,7 @@ def as_measured(
     """
     cameras = {}
     for name, camera in demonstration.steps.cameras.items():
-        depth = np.stack([_measured(z, errors, holes, rng) for z in camera.depth])
+        depth = np.stack([measured_depth(z, errors, holes, rng) for z in camera.depth])
         off = pose(
             errors.hand_eye * sample_direction(rng, "area"),
             errors.hand_eye_angle * sample_direction(rng, "area"),
@@ -49,9 +49,10 @@ def as_measured(
     return dataclasses.replace(demonstration, steps=steps)
 
 
-def _measured(
+def measured_depth(
     depth: DepthImage, errors: SensorErrors, holes: float, rng: np.random.Generator
 ) -> DepthImage:
+    """A depth image `(H, W)` [m] as a sensor with such errors measures it, see `as_measured`."""
     z = depth.astype(np.float64)
     seen = z > 0
     flat = z.ravel().copy()

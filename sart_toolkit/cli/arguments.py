@@ -39,7 +39,11 @@ _TASK = Annotated[
     arg(metavar="TASK", help="Task, such as peg_in_hole, or your own: drawer.py:Drawer."),
 ]
 _BACKEND = Annotated[
-    str, arg(metavar="REF", help="Simulator or robot to run on: pybullet, sapien, or your own.")
+    str,
+    arg(
+        metavar="REF",
+        help="Simulator or robot to run on: pybullet, sapien, a cell's TOML file, or your own.",
+    ),
 ]
 _REF = "a name, module:NAME or file.py:NAME"
 _ROBOT = Annotated[str | None, _optional("REF", f"Robot, as {_REF}; the task's own if left out.")]
@@ -787,6 +791,36 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class Deploy:
+    """Let a skill act on a real robot, from where it stands.
+
+    Example: sart deploy skill --backend cell.toml --dry-run
+
+    Example: sart deploy skill --backend cell.toml
+
+    The first shows what it sees and decides without moving. The robot moves at the speed scale of
+    its cell's file, once you have pressed Enter; Ctrl-C stops it.
+    """
+
+    skill: Annotated[Positional[Path], arg(metavar="SKILL", help="Directory from `sart train`.")]
+    backend: Annotated[
+        str | None,
+        _optional("CELL", "The cell's TOML file, or your own; what the skill notes if left out."),
+    ] = None
+    task: _NOTED_TASK = None
+    robot: _NOTED_ROBOT = None
+    max_seconds: Annotated[
+        float | None, _optional("SECONDS", "How long it acts [s]; the task's horizon if left out.")
+    ] = None
+    dry_run: Annotated[bool, arg(help="See and decide, and move nothing.")] = False
+    unattended: Annotated[
+        bool, arg(help="Begin without a person's key, where this isn't typed at a terminal.")
+    ] = False
+    device: _DEVICE = "cpu"
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
 class BenchmarkOperator:
     """How often the scripted operator reaches the goal, on each task and backend.
 
@@ -1071,6 +1105,10 @@ class Doctor:
     joints, gripper, cameras and home, and how it moves in both simulators.
 
     Example: sart doctor --robot my_arm.py:MY_ARM --image my_arm.png
+
+    With --cell, say instead what a real cell's parts answer: all is read, and nothing moves.
+
+    Example: sart doctor --cell cell.toml
     """
 
     full: Annotated[
@@ -1079,6 +1117,9 @@ class Doctor:
     robot: Annotated[str | None, _optional("REF", f"Robot to examine instead, as {_REF}.")] = None
     image: Annotated[
         Path | None, _optional("PNG", "Where to write what the robot's cameras see at home.")
+    ] = None
+    cell: Annotated[
+        Path | None, _optional("TOML", "File of a real cell whose parts are asked instead.")
     ] = None
     json: _JSON = False
 

@@ -27,6 +27,7 @@ _UNITS = {
     "train": "step",
     "sweep": "training",
     "evaluate": "rollout",
+    "deploy": "s",
     "operator": "episode",
     "replay": "replay",
     "segments": "segment",

@@ -19,7 +19,13 @@ def doctor_verb(args: Doctor) -> dict[str, Any]:
         raise InvalidInput("--image: is of a robot; add --robot REF")
     if args.robot is not None and args.full:
         raise InvalidInput("--full: is about this machine; leave it out, or --robot")
-    findings = _of_robot(args.robot, args.image) if args.robot else doctor.diagnose(args.full)
+    other = next((f for f in ("full", "robot", "image") if getattr(args, f)), None)
+    if args.cell is not None and other is not None:
+        raise InvalidInput(f"--{other}: is not about a cell; leave it out, or --cell")
+    if args.cell is not None:
+        findings = _of_cell(args.cell)
+    else:
+        findings = _of_robot(args.robot, args.image) if args.robot else doctor.diagnose(args.full)
     usable = all(finding.ok for finding in findings if finding.required)
     result: dict[str, Any] = {"usable": usable}
     if args.json:
@@ -34,12 +40,19 @@ def doctor_verb(args: Doctor) -> dict[str, Any]:
             key = f"{mark} {finding.name}"
             # A robot may have several findings of one name.
             result[key] = f"{result[key]}\n      {line}" if key in result else line
-        if not args.full and not args.robot:
+        if not args.full and not args.robot and not args.cell:
             result["?"] = "is installed; `sart doctor --full` tests it"
     if not usable:
         show(result, args.json)
         sys.exit(1)
     return result
+
+
+def _of_cell(path: Path) -> list[doctor.Finding]:
+    from sart_toolkit.bringup.cell import examine_cell
+    from sart_toolkit.hardware.cell import load_cell
+
+    return examine_cell(load_cell(path))
 
 
 def _of_robot(reference: str, image: Path | None) -> list[doctor.Finding]:

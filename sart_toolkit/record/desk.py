@@ -96,6 +96,8 @@ class RecordingDesk:
 
     def _ended_notice(self) -> Notice:
         session = self.session
+        if session.end is End.ROBOT_STOPPED:
+            return Notice(f"{session.trouble}. → saves what was recorded until then.", "bad")
         if session.achieved:
             return Notice("Goal reached. Press → to save.", "good")
         if session.judged_by == "nobody":
@@ -154,6 +156,8 @@ class RecordingDesk:
                 self._go_on()
             case SessionState.RECORDING:
                 session.stop()
+            case SessionState.ENDED if session.end is End.ROBOT_STOPPED:
+                self._keep()
             case SessionState.ENDED if session.judged_by == "nobody":
                 session.say_reached()
                 self._keep()

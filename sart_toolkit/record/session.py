@@ -12,7 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from sart_toolkit.backends.interface import (
     missing_abilities,
 )
 from sart_toolkit.data.records import Demonstration, Judge, library_versions
-from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
+from sart_toolkit.errors import InvalidInput, MotionRejected, RobotStopped, Unreachable
 from sart_toolkit.motion.config import ControllerConfig
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.poses import Array, apply_motion, check_array, check_positive, frozen
@@ -138,6 +138,7 @@ class End(enum.Enum):
     """Why a recording ended."""
 
     STOPPED = "stopped"
+    ROBOT_STOPPED = "robot stopped"
     SUCCESS = "goal reached"
     TIME = "time is up"
 
@@ -366,16 +367,23 @@ class TeleopSession:
         """Carry a command out for one control period; the last of a recorded step ends that.
 
         A command that leads out of reach is not carried out: the tool stays where it is, and
-        `trouble` says why.
+        `trouble` says why. Where a real robot stops the recording ends, and `trouble` says why; the
+        whole steps until then are kept.
 
         Raises:
             InvalidInput: it isn't recording.
         """
         self._expect("advance", SessionState.RECORDING)
-        if command.stop:
-            self.stop()
+        try:
+            if command.stop:
+                self.stop()
+                return
+            self._step(command.velocity, command.gripper)
+        except RobotStopped as error:
+            del self._raw[(self.steps - 1) * self.backend.rates.control_per_record :]
+            self.trouble = str(error)
+            self._end(End.ROBOT_STOPPED)
             return
-        self._step(command.velocity, command.gripper)
         if len(self._raw) % self.backend.rates.control_per_record:
             return
         if self.config.end_on_success and self.achieved:
@@ -483,7 +491,9 @@ class TeleopSession:
             "backend": reference_to("backend", type(self.backend), BACKENDS),
             **self.config.references,
         }
-        parameters = {"placement": self.placement.to_json()}
+        parameters: dict[str, Any] = {"placement": self.placement.to_json()}
+        if self.backend.delays:
+            parameters["image_delays"] = self.backend.delays
         if self.config.appearance is not None:
             parameters["appearance"] = self.config.appearance.to_json()
         return Demonstration(
@@ -521,6 +531,7 @@ def record_demonstration(
     seed: int | None = None,
     config: SessionConfig | None = None,
     progress: Callable[[float], None] | None = None,
+    keep: Callable[[Demonstration], None] | None = None,
 ) -> Demonstration:
     """One demonstration of a task, steered by a device until it says stop, as fast as it goes.
 
@@ -536,9 +547,11 @@ def record_demonstration(
         seed: the device's seed, kept with the demonstration.
         config: cameras and limits.
         progress: called with the seconds recorded so far.
+        keep: called with what was recorded until a real robot stopped, before that is raised.
 
     Raises:
         InvalidInput: the device did not stop within `max_seconds`.
+        RobotStopped: a real robot did.
         UnknownName: there is no such camera.
         MissingCapability: the backend takes no images.
     """
@@ -550,6 +563,10 @@ def record_demonstration(
         if progress is not None and session.steps > steps:
             steps = session.steps
             progress(steps / backend.rates.record_hz)
+    if session.end is End.ROBOT_STOPPED:
+        if keep is not None:
+            keep(session.demonstration(device.operator, device.name, 0.0, seed))
+        raise RobotStopped(session.trouble)
     if session.end is End.TIME:
         raise InvalidInput(
             f"the demonstration did not end within {session.config.max_seconds:g} s: "

@@ -106,7 +106,8 @@ class RecordingWindow:
         if not desk.session.config.cameras:
             raise InvalidInput("window: the recording has no camera to show; record with one")
         self._desk, self._screen, self._target = desk, screen, target
-        cameras = [camera.name for camera in desk.session.backend.scene.cameras]
+        backend = desk.session.backend
+        cameras = [c.name for c in backend.scene.cameras if c.name in backend.cameras]
         self._camera = cameras[0] if cameras else desk.session.config.cameras[0]
         self._scene: Image | None = None
         self._drawn: tuple[int, float] | None = None

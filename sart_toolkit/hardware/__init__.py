@@ -1,0 +1,18 @@
+"""A real robot's parts behind small interfaces, and how its arm is moved.
+
+`drivers` says what an arm, a gripper and a camera promise; each maker's is one file and one line in
+`DRIVERS`. One outside the repository needs no line, `package.module:NAME` or
+`path/to/file.py:NAME` names it. `cell` reads the file that says which of them a cell has, `servo`
+moves the arm, one period of its controller at a time.
+"""
+
+from __future__ import annotations
+
+ARMS = {
+    "ur_rtde": "sart_toolkit.hardware.ur:UrRtdeArm",
+    "lerobot": "sart_toolkit.hardware.lerobot:LeRobotArm",
+}
+GRIPPERS = {"robotiq_socket": "sart_toolkit.hardware.robotiq:RobotiqSocket"}
+CAMERAS = {"realsense": "sart_toolkit.hardware.realsense:RealSense"}
+# By the kind of part that a cell's file names.
+DRIVERS = {"arm": ARMS, "gripper": GRIPPERS, "camera": CAMERAS}
