@@ -18,8 +18,9 @@ from sart_toolkit.data.storage import check_writable, replacing
 from sart_toolkit.errors import InvalidInput, MissingExtra, unknown_name
 from sart_toolkit.poses import Array, check_positive
 
-# 508 dpi: a module of the default board is 60 pixels wide.
-_PIXELS_PER_MM = 20
+# 254 dpi: a module of the default board is 30 pixels wide.
+_PIXELS_PER_MM = 10
+_MOST_PIXELS = 9000
 _MM_PER_INCH = 25.4
 # Paper by name, width and height [mm], upright.
 _PAPER = ((210, 297), (216, 279), (297, 420), (420, 594), (594, 841), (841, 1189))
@@ -27,6 +28,8 @@ _PAPER = ((210, 297), (216, 279), (297, 420), (420, 594), (594, 841), (841, 1189
 _MARGIN_MM = 6
 # A corner that few others confirm may be a reflection or a second board.
 _LEAST_CORNERS = 6
+# Least and largest distance [pixels] from a corner at which its edges are looked at.
+_WINDOW = (2, 8)
 
 
 def opencv() -> Any:
@@ -130,15 +133,30 @@ class Board:
         """
         cv2 = opencv()
         grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
-        pixels, numbers, _, _ = cv2.aruco.CharucoDetector(self._opencv()).detectBoard(grey)
+        detector, threads = cv2.aruco.CharucoDetector(self._opencv()), cv2.getNumThreads()
+        # Threads of its own spend more time waiting for each other than they save.
+        cv2.setNumThreads(1)
+        try:
+            pixels, numbers, _, _ = detector.detectBoard(grey)
+        finally:
+            cv2.setNumThreads(threads)
         if numbers is None or len(numbers) < _LEAST_CORNERS:
             return None
-        found = FoundCorners(numbers.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(float))
+        numbers, pixels = numbers.ravel().astype(np.int64), pixels.reshape(-1, 2)
+        places = np.stack(np.divmod(numbers, self.columns - 1), axis=1)
         # A single row says nothing of how the board is tilted.
-        places = np.stack(np.divmod(found.numbers, self.columns - 1), axis=1)
         if (np.ptp(places, axis=0) == 0).any():
             return None
-        return found
+        apart = np.abs(places[:, None] - places).sum(axis=2) == 1
+        if not apart.any():
+            return None
+        spacing = float(np.linalg.norm(pixels[:, None] - pixels, axis=2)[apart].min())
+        # OpenCV's own window reaches the markers' edges, which draw corners aside by 0.2 pixels.
+        blank = spacing * (self.square - self.marker) / (2 * self.square)
+        half = int(np.clip(blank - 2, *_WINDOW))
+        steps = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
+        refined = cv2.cornerSubPix(grey, pixels.copy(), (half, half), (-1, -1), steps)
+        return FoundCorners(numbers, refined.reshape(-1, 2).astype(np.float64))
 
 
 def save_board(path: Path, board: Board, overwrite: bool = False) -> None:
@@ -155,7 +173,10 @@ def save_board(path: Path, board: Board, overwrite: bool = False) -> None:
     if path.suffix not in (".pdf", ".png"):
         raise InvalidInput(f"{path}: a board is written as .pdf or .png; change its name")
     check_writable(path, overwrite)
-    drawn = PillowImage.fromarray(board.image(round(board.square * 1e3 * _PIXELS_PER_MM)))
+    square_pixels = min(
+        board.square * 1e3 * _PIXELS_PER_MM, _MOST_PIXELS / max(board.columns, board.rows)
+    )
+    drawn = PillowImage.fromarray(board.image(round(square_pixels)))
     # A square needs a whole number of pixels; the resolution makes it its size.
     per_mm = drawn.width / (board.columns * board.square * 1e3)
     words, line = 12, 100

@@ -33,7 +33,7 @@ def test_an_image_without_it_or_with_a_single_row_of_corners_shows_none():
     assert board.find(np.repeat(strip[..., None], 3, axis=2)) is None
 
 
-@pytest.mark.parametrize("board", [Board(), Board(6, 5, 0.04, 0.03, "DICT_5X5_100")], ids=repr)
+@pytest.mark.parametrize("board", [Board(), Board(6, 4, 0.04, 0.03, "DICT_5X5_100")], ids=repr)
 def test_as_pdf_and_png_its_squares_have_their_true_size(board, tmp_path):
     save_board(tmp_path / "board.png", board)
     with Image.open(tmp_path / "board.png") as page:
