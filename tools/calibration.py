@@ -1,19 +1,21 @@
 """How well a wrist camera's mounting is found: `python tools/calibration.py --out F.json`.
 
 For each draw the camera is mounted a little otherwise, the arm looks at the board from some sides,
-and a simulator draws what the camera sees, which is then blurred and made noisy; the joints that
-the robot reports are off, too. The camera is calibrated from that, and the estimate compared with
-where the camera really was: how far it is off, and whether no farther than was declared. Depth is
-too large by a known factor, which is to be found as well.
+and what the camera sees is drawn by SAPIEN or by the ray caster that draws for PyBullet, then
+blurred and made noisy; the joints that the robot reports are off, too. The camera is calibrated
+from that, and the estimate compared with where the camera really was: how far it is off, and
+whether no farther than was declared. Depth is too large by a known factor, which is to be found as
+well.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,8 @@ from scipy.ndimage import gaussian_filter
 
 from sart_toolkit import doctor
 from sart_toolkit.backends import make_backend
-from sart_toolkit.backends.interface import Backend, Draws, require
+from sart_toolkit.backends.interface import CameraView, Draws, require
+from sart_toolkit.backends.raycast import RayCaster
 from sart_toolkit.calibrate.board import Board
 from sart_toolkit.calibrate.hand_eye import BoardView, calibrate_camera
 from sart_toolkit.data.records import library_versions
@@ -32,8 +35,10 @@ from sart_toolkit.poses import Array, apply_motion, distance, inverse, pose
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import CameraSpec, Shape, look_at
-from sart_toolkit.scenes.spec import Body, SceneSpec
+from sart_toolkit.robots.visuals import shape_mesh
+from sart_toolkit.scenes.spec import Body, Light, SceneSpec
 
+_ROBOT = "ur5e_2f85"
 # A square of the default board is so many cells wide, its markers' modules a whole number of them.
 _CELLS = 50
 # What is printed stands out of the paper by so much [m].
@@ -87,16 +92,33 @@ def rectangles(cells: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
     return found
 
 
-def make(backend: str, board: Board) -> Backend:
-    """The robot and the board on a backend."""
-    return make_backend(backend, get_robot("ur5e_2f85"), SceneSpec((board_body(board),)), _SIZE)
+# Draws the robot at joints `(n,)` and the board, by a camera in the world.
+Artist = Callable[[Array, CameraSpec, int, int], CameraView]
+
+
+@contextlib.contextmanager
+def drawing(name: str, board: Board) -> Iterator[Artist]:
+    """What draws: "raycast", the board alone, or a backend with the ability, robot and board."""
+    body = board_body(board)
+    if name == "raycast":
+        caster = RayCaster({body.name: [shape_mesh(shape) for shape in body.shapes]}, Light())
+        at = {body.name: body.T_world_body}
+        yield lambda q, camera, width, height: caster.view(camera, np.eye(4), (width, height), at)
+        return
+    scene = SceneSpec((body,))
+    backend = make_backend(name, get_robot(_ROBOT), scene, _SIZE)
+    artist = require(backend, Draws, "it draws what the camera sees")
+    with contextlib.closing(backend):
+        yield lambda q, camera, width, height: artist.draw(
+            scene.initial_state(q, 0.0), camera, width, height
+        )
 
 
 def draw_views(
-    backend: Backend, board: Board, views: int, rng: np.random.Generator, joint_noise_deg: float
+    draw: Artist, board: Board, views: int, rng: np.random.Generator, joint_noise_deg: float
 ) -> tuple[Array, Array, list[BoardView]]:
     """Where the camera is on the tool `(4, 4)`, its intrinsics, and what it sees of the board."""
-    model = RobotModel(backend.robot)
+    model = RobotModel(get_robot(_ROBOT))
     T_tool_camera = model.mounted_cameras()["wrist"][1]
     # A person screws it on to within a centimetre and some degrees.
     T_tool_camera = apply_motion(
@@ -104,7 +126,7 @@ def draw_views(
     )
     lens = CameraSpec("calibrated", "world", np.eye(4), _FOV_DEG)
     middle = T_WORLD_BOARD @ [board.columns * board.square / 2, board.rows * board.square / 2, 0, 1]
-    home = np.array(backend.robot.home)
+    home = np.array(model.spec.home)
     drawn: list[BoardView] = []
     while len(drawn) < views:
         away, turn = rng.uniform(0.28, 0.42), rng.uniform(0, 2 * np.pi)
@@ -119,21 +141,19 @@ def draw_views(
             q = model.ik(T_world_camera @ inverse(T_tool_camera), home)
         except Unreachable:
             continue
-        rgb, depth = picture(backend, q, T_world_camera, lens, rng)
+        rgb, depth = picture(draw, q, T_world_camera, lens, rng)
         reported = q + rng.normal(0, np.deg2rad(joint_noise_deg), len(q))
         drawn.append(BoardView(f"view {len(drawn)}", model.fk(reported), rgb, depth))
     return T_tool_camera, lens.intrinsics(*_SIZE), drawn
 
 
 def picture(
-    backend: Backend, q: Array, T_world_camera: Array, lens: CameraSpec, rng: np.random.Generator
+    draw: Artist, q: Array, T_world_camera: Array, lens: CameraSpec, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """What the camera sees, with blur and noise, and its depth with noise, too large."""
     camera = CameraSpec("calibrated", "world", T_world_camera, lens.fov_y_deg)
     width, height = _SIZE
-    state = backend.scene.initial_state(q, 0.0)
-    artist = require(backend, Draws, "the camera's images are drawn")
-    seen = artist.draw(state, camera, _RAYS * width, _RAYS * height)
+    seen = draw(q, camera, _RAYS * width, _RAYS * height)
     sharp = seen.rgb.reshape(height, _RAYS, width, _RAYS, 3).mean(axis=(1, 3))
     soft = gaussian_filter(sharp, (rng.uniform(0.4, 1.0),) * 2 + (0,))
     noisy = soft * rng.uniform(0.7, 1.0) + rng.normal(0, 3.0, soft.shape)
@@ -144,19 +164,19 @@ def picture(
 
 
 def measure(
-    backend: Backend, seed: int, views: int, joint_noise_deg: float, given: bool
+    draw: Artist, name: str, seed: int, views: int, joint_noise_deg: float, given: bool
 ) -> dict[str, Any]:
     """A row for one draw: how far the estimate is from the truth, and what was declared."""
     board = Board()
     rng = np.random.default_rng(seed)
-    T, K, drawn = draw_views(backend, board, views, rng, joint_noise_deg)
+    T, K, drawn = draw_views(draw, board, views, rng, joint_noise_deg)
     start = time.perf_counter()
     found = calibrate_camera(drawn, board, intrinsics=K if given else None)
     seconds = time.perf_counter() - start
     metres, angle = distance(T, found.T_frame_camera)
     assert found.depth_scale is not None and found.depth_scale_error is not None
     return {
-        "backend": backend.name,
+        "drawn_by": name,
         "seed": seed,
         "intrinsics": "given" if given else "estimated",
         "views": found.views,
@@ -196,20 +216,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code: 0 if what was declared covers the truth in 95 % of draws at least."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--draws", type=int, default=50, help="half of them on each backend")
+    parser.add_argument("--draws", type=int, default=50, help="half of them by each")
     parser.add_argument("--views", type=int, default=16)
-    parser.add_argument("--backends", nargs="*", default=["pybullet", "sapien"])
+    parser.add_argument("--by", nargs="*", default=["raycast", "sapien"])
     parser.add_argument("--joint-noise-deg", type=float, default=0.01)
     options = parser.parse_args(arguments)
     rows = []
-    for number, name in enumerate(options.backends):
-        backend = make(name, Board())
-        for seed in range(number, options.draws, len(options.backends)):
-            given = seed // len(options.backends) % 2 == 0
-            row = measure(backend, seed, options.views, options.joint_noise_deg, given)
-            rows.append(row)
-            print(json.dumps(row), file=sys.stderr, flush=True)
-        backend.close()
+    for number, name in enumerate(options.by):
+        with drawing(name, Board()) as draw:
+            for seed in range(number, options.draws, len(options.by)):
+                given = seed // len(options.by) % 2 == 0
+                row = measure(draw, name, seed, options.views, options.joint_noise_deg, given)
+                rows.append(row)
+                print(json.dumps(row), file=sys.stderr, flush=True)
     told = summary(rows)
     report = {
         "command": f"python tools/calibration.py {' '.join(arguments or sys.argv[1:])}".strip(),

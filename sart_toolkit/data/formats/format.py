@@ -190,11 +190,19 @@ class Given:
 
         Raises:
             UnknownName: the file hasn't one that is named.
+            InvalidInput: intrinsics are given of one that isn't read.
         """
         for theirs in self.camera_names.values():
             if theirs not in there:
                 raise unknown_name("camera", theirs, there)
-        return dict(self.camera_names) or {name: name for name in there}
+        chosen = dict(self.camera_names) or {name: name for name in there}
+        for name in self.intrinsics:
+            if name not in chosen:
+                raise InvalidInput(
+                    f"camera {name!r}: has a calibration or intrinsics but isn't in the recording, "
+                    f"which has {', '.join(there) or 'none'}; add --cameras {name}=THEIRS"
+                )
+        return chosen
 
     def mounting(self, name: str) -> tuple[CameraFrame, Array]:
         """What a camera is mounted on, and its pose `(4, 4)` there.

@@ -282,6 +282,11 @@ class _Episode:
         if arm is None:
             raise InvalidInput("the kinematics are known from the robot alone; add --robot REF")
         if joints is not None:
+            if self._given.rotation is not None or arm.T_frame_tool is not None:
+                raise InvalidInput(
+                    f"{which}joints: have no rotation and no frame; leave --rotation and "
+                    "--pose-frame out"
+                )
             if joints.shape[1] != len(arm.home):
                 raise InvalidInput(
                     f"joints: {joints.shape[1]} numbers a row, the robot has {len(arm.home)} arm "

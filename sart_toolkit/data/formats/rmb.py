@@ -262,6 +262,8 @@ class _Recording:
         # What only the toolkit's own files say.
         self._ours: dict[str, Any] = {} if text is None else json.loads(text)
         given.check_unsaid(("columns", "rotation"), "has columns of fixed names")
+        if given.arm is not None and given.arm.T_frame_tool is not None:
+            raise InvalidInput("poses come from its joints; leave --pose-frame out")
         if self._ours:
             given.check_unsaid(SAID_BY_OURS, "says itself what this would")
         self._cameras = [str(name) for name in np.ravel(file.attrs.get("camera_names", []))]

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
+from PIL import Image as PillowImage
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit import pipeline
@@ -29,6 +33,7 @@ from sart_toolkit.data.formats.lerobot import (
     LeRobot,
     depth_levels,
 )
+from sart_toolkit.data.formats.rmb import MAIN
 from sart_toolkit.data.formats.video import VideoWriter, best_codec
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import load_demonstration
@@ -315,9 +320,10 @@ def test_without_a_robot_it_is_asked_for(command, refused):
     ids=str,
 )
 def test_columns_that_are_none_are_refused(columns, complaint, foreign):
+    posed = "tool_pose" in columns
     given = dataclasses.replace(
-        pipeline._given("peg_in_hole", "ur5e_2f85", "tool", [], {}),
-        columns=columns, rotation="rotvec", gripper_range=(1.0, 0.0),
+        pipeline._given("peg_in_hole", "ur5e_2f85", "tool" if posed else None, [], {}),
+        columns=columns, rotation="rotvec" if posed else None, gripper_range=(1.0, 0.0),
     )  # fmt: skip
     with pytest.raises((InvalidInput, UnknownName)) as caught:
         LeRobot().read(foreign / "episode_000001", given)
@@ -349,6 +355,37 @@ def test_options_that_can_not_be_honoured_are_refused(command, refused, calibrat
     )
 
 
+def test_what_is_about_poses_is_refused_with_joints(command, refused):
+    words = [str(w).replace("tool_pose=observation.state[0:6]", "joints=observation.state[7:13]")
+             for w in command]  # fmt: skip
+    assert "joints: have no rotation and no frame; leave --rotation" in refused(*words)
+
+
+def test_a_calibration_of_a_camera_that_is_not_read_is_refused(command, refused):
+    assert "camera 'wrist': has a calibration or intrinsics but isn't in the recording, which " in (
+        refused(*without(command, "--cameras"), "--cameras", "overview=hand")
+    )
+
+
+def test_images_in_the_table_are_read_as_well(command, foreign, said, tmp_path, peg_demonstration):
+    copy, place = tmp_path / "copy", {"chunk_index": 0, "file_index": 0}
+    shutil.copytree(foreign, copy)
+    rgb = peg_demonstration.steps.cameras["wrist"].rgb
+    cells = []
+    for image in [*rgb[::-1], *rgb]:
+        PillowImage.fromarray(image).save(content := io.BytesIO(), "PNG")
+        cells.append({"bytes": content.getvalue(), "path": None})
+    table = parquet.read_table(copy / DATA.format(**place))
+    key = "observation.images.hand"
+    parquet.write_table(table.append_column(key, pa.array(cells)), copy / DATA.format(**place))
+    info = json.loads((copy / INFO).read_text())
+    info["features"][key]["dtype"] = "image"
+    (copy / INFO).write_text(json.dumps(info))
+    said(*[copy if word == foreign else word for word in command])
+    read = load_demonstration(tmp_path / "demo.h5")
+    assert np.array_equal(read.steps.cameras["wrist"].rgb, rgb)
+
+
 def test_a_dataset_of_an_older_version_is_refused(foreign, tmp_path):
     info = json.loads((foreign / INFO).read_text()) | {"codebase_version": "v2.1"}
     (tmp_path / "meta").mkdir()
@@ -358,8 +395,6 @@ def test_a_dataset_of_an_older_version_is_refused(foreign, tmp_path):
 
 
 def test_a_file_that_is_missing_or_short_is_told(foreign, tmp_path):
-    import shutil
-
     copy = tmp_path / "copy"
     shutil.copytree(foreign, copy)
     place = {"chunk_index": 0, "file_index": 0}
@@ -381,12 +416,6 @@ def test_a_recording_from_elsewhere_is_annotated_and_augmented_from_its_images(
     if name == "lerobot":
         said(*command)
     else:
-        import shutil
-
-        import h5py
-
-        from sart_toolkit.data.formats.rmb import MAIN
-
         recording = tmp_path / "peg.rmb"
         shutil.copytree(sorted(exported("rmb").glob("*.rmb"))[0], recording)
         with h5py.File(recording / MAIN, "r+") as file:

@@ -311,5 +311,8 @@ def test_cameras_are_taken_by_our_names_with_measured_intrinsics(copy_of):
     format.read(recording, given)
     with pytest.raises(InvalidInput, match="add --calibration FILE, or --camera-intrinsics hand="):
         format.read(recording, dataclasses.replace(given, intrinsics={}))
+    posed = dataclasses.replace(given.arm, T_frame_tool=pose())
+    with pytest.raises(InvalidInput, match="poses come from its joints; leave --pose-frame out"):
+        format.read(recording, dataclasses.replace(given, arm=posed))
     with pytest.raises(InvalidInput, match="has columns of fixed names; leave --columns out"):
         format.read(recording, dataclasses.replace(given, columns={"joints": "a"}))
