@@ -5,6 +5,8 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from sart_toolkit.data.dataset import Dataset, Source, count_demonstrations
 from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.records import (
+    DEFAULT_RATES,
     CameraFrame,
     CameraRecord,
     Demonstration,
@@ -27,7 +30,7 @@ from sart_toolkit.data.records import (
     library_versions,
 )
 from sart_toolkit.errors import BrokenFile, InvalidInput, unknown_name
-from sart_toolkit.poses import Array, check_poses
+from sart_toolkit.poses import Array, StraightLine, check_poses, relative_motion
 
 ACTION_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 # How much a step's time may be off the recording's period, as a fraction of it.
@@ -291,8 +294,33 @@ def poses_of(rows: Array, rotation: str) -> Array:
     return check_poses("tool_pose", Ts)
 
 
+def commands_along(Ts_world_tool: Array, gripper: Array, rates: Rates) -> Array:
+    """Tool velocities and gripper targets `(m, 7)` that lead along commanded poses.
+
+    One for each control period, as an operator would have given them, straight from a step to the
+    next; without them a robot couldn't follow the recording.
+
+    Args:
+        Ts_world_tool: the commanded poses `(n, 4, 4)`.
+        gripper: the commanded gripper `(n,)`.
+        rates: how often it is commanded and recorded.
+    """
+    parts, rows = rates.control_per_record, []
+    for T_from, T_to, target in zip(
+        Ts_world_tool[:-1], Ts_world_tool[1:], gripper[1:], strict=True
+    ):
+        line = StraightLine(T_from, T_to)
+        Ts = [line(i / parts) for i in range(parts + 1)]
+        for a, b in itertools.pairwise(Ts):
+            rows.append([*(relative_motion(a, b) * rates.control_hz), target])
+    return np.array(rows).reshape(-1, 7)
+
+
 def even_rates(time: Array) -> Rates:
-    """The rates that a recording's times `(n,)` [s] tell; nothing else is known.
+    """The rate of a recording by its times `(n,)` [s], with those at which it is executed again.
+
+    How often it was commanded isn't known; a robot that follows it is commanded in as many even
+    steps as come to the default rates or more.
 
     Raises:
         InvalidInput: they are uneven.
@@ -303,7 +331,9 @@ def even_rates(time: Array) -> Rates:
         raise InvalidInput(
             "time: steps are missing or uneven, or fewer than one a second; cut the recording"
         )
-    return Rates(hz, hz, hz)
+    control_hz = hz * math.ceil(DEFAULT_RATES.control_hz / hz)
+    physics_hz = control_hz * math.ceil(DEFAULT_RATES.physics_hz / control_hz)
+    return Rates(physics_hz, control_hz, hz)
 
 
 class Reads(Format):

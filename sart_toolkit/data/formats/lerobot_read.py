@@ -23,6 +23,7 @@ from sart_toolkit.data.formats.format import (
     ROTATIONS,
     SAID_BY_OURS,
     Given,
+    commands_along,
     even_rates,
     poses_of,
 )
@@ -152,6 +153,7 @@ class _Episode:
         steps, ours = self._steps(), self._ours
         n = len(steps)
         time = self._numbers("timestamp")[:, 0]
+        rates = Rates(**ours["rates"]) if ours else even_rates(time)
         success = np.zeros(n, bool)
         if ours:
             success[-1] = self._row["sart/success"]
@@ -165,13 +167,15 @@ class _Episode:
             body_Ts_world={},
             success=success,
             touching=((),) * n,
-            raw_commands=np.empty((0, 7)),
+            raw_commands=commands_along(
+                steps.commanded_Ts_world_tool, steps.commanded_gripper, rates
+            ),
             states=(),
             operator=self._provenance.get("operator", "unknown"),
             device="imported",
             seconds=0.0,
             versions=library_versions(),
-            rates=Rates(**ours["rates"]) if ours else even_rates(time),
+            rates=rates,
             judged_by="task" if ours else "nobody",
             references=ours.get("references", self._given.references),
         )

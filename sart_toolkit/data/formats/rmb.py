@@ -27,6 +27,7 @@ from sart_toolkit.data.formats.format import (
     Reads,
     Trajectory,
     all_problems,
+    commands_along,
     even_rates,
     poses_of,
     quaternions,
@@ -274,6 +275,7 @@ class _Recording:
         n, ours = len(steps), self._ours
         time = rows(self._file, "time")[:, 0]
         provenance = ours.get("provenance", {})
+        rates = Rates(**ours["rates"]) if ours else even_rates(time)
         success = rows(self._file, "reward")[:, 0] > 0 if ours else np.zeros(n, bool)
         return Demonstration(
             task=self._said("task"),
@@ -285,13 +287,15 @@ class _Recording:
             body_Ts_world={},
             success=success,
             touching=((),) * n,
-            raw_commands=np.empty((0, 7)),
+            raw_commands=commands_along(
+                steps.commanded_Ts_world_tool, steps.commanded_gripper, rates
+            ),
             states=(),
             operator=provenance.get("operator", "unknown"),
             device="imported",
             seconds=0.0,
             versions=library_versions(),
-            rates=Rates(**ours["rates"]) if ours else even_rates(time),
+            rates=rates,
             judged_by="task" if ours else "nobody",
             references=ours.get("references", self._given.references),
         )

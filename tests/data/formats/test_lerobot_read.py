@@ -407,6 +407,38 @@ def test_a_file_that_is_missing_or_short_is_told(foreign, tmp_path):
         LeRobot().read(copy / "episode_000001", Given())
 
 
+# A robot that nobody can reset and that knows no bodies, at the demonstration's start.
+CELL = """
+import dataclasses
+
+import sart_toolkit as sart
+from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.tasks.task import Placement
+
+
+class Cell(sart.Backend):
+    name = "cell"
+
+    def __init__(self, robot, scene, *options):
+        super().__init__(robot, scene, *options)
+        self._whole = sart.get_backend("pybullet")(robot, scene, *options)
+        model = RobotModel(robot, scene.held)
+        self._whole.reset(sart.get_task("peg_in_hole").initial_state(model, Placement()))
+
+    def observe(self, *args):
+        return dataclasses.replace(self._whole.observe(*args), Ts_world_body={})
+
+    def command(self, q, gripper):
+        return self._whole.command(q, gripper)
+
+    def step(self):
+        self._whole.step()
+
+    def close(self):
+        self._whole.close()
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lerobot", "rmb"])
 def test_a_recording_from_elsewhere_is_annotated_and_augmented_from_its_images(
@@ -431,10 +463,12 @@ def test_a_recording_from_elsewhere_is_annotated_and_augmented_from_its_images(
     sensor = settings["cloud"]["sensor"]
     assert sensor["hand_eye"] == pytest.approx(0.0006, abs=1e-5)
     assert sensor["depth_scale"] == pytest.approx(0.002)
-    made = said(
-        "augment", demo, spheres, "--out", tmp_path / "dataset", "--n", 4, "--backend", "pybullet",
-        "--source", "cloud",
+    (tmp_path / "cell.py").write_text(CELL)
+    asked: list[str] = []
+    dataset = pipeline.augment(
+        demo, spheres, tmp_path / "dataset", backend=f"{tmp_path / 'cell.py'}:Cell", n=4,
+        obstacles="cloud", cameras=("wrist",), ask=asked.append,
     )  # fmt: skip
-    assert made["trajectories"] == 4
+    assert len(dataset) == 3 and asked
     checked = said("validate", tmp_path / "dataset")
-    assert checked["episodes"] == 3
+    assert checked["episodes"] == 3 and checked["least_measured_clearance_mm"] > 0
