@@ -53,10 +53,10 @@ $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
 	        "$$($(PYTHON) --version 2>&1). Type: make $(MAKECMDGOALS)" \
 	        "PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym]'
+	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate]'
 	@touch $@
 
 $(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh
 	bash tools/setup_debian.sh annotate teleop
-	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,teleop,annotate]'
+	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate,teleop,annotate]'
 	@touch $@

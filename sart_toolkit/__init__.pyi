@@ -85,6 +85,23 @@ from .backends.states import (
 from .backends.states import (
     unpack_state as unpack_state,
 )
+from .calibrate.board import Board as Board
+from .calibrate.board import save_board as save_board
+from .calibrate.calibration import (
+    Calibration as Calibration,
+)
+from .calibrate.calibration import (
+    declared_errors as declared_errors,
+)
+from .calibrate.calibration import (
+    load_calibration as load_calibration,
+)
+from .calibrate.calibration import (
+    save_calibration as save_calibration,
+)
+from .calibrate.hand_eye import BoardView as BoardView
+from .calibrate.hand_eye import CalibrateConfig as CalibrateConfig
+from .calibrate.hand_eye import calibrate_camera as calibrate_camera
 from .collision import make_world as make_world
 from .collision.certificate import Certificate as Certificate
 from .collision.certificate import certify as certify
@@ -111,6 +128,7 @@ from .data.dataset import load_dataset as load_dataset
 from .data.formats import FORMATS as FORMATS
 from .data.formats import get_format as get_format
 from .data.formats.format import About as About
+from .data.formats.format import Arm as Arm
 from .data.formats.format import Format as Format
 from .data.formats.format import Given as Given
 from .data.formats.format import Reads as Reads

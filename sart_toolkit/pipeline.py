@@ -69,15 +69,18 @@ if TYPE_CHECKING:
     from sart_toolkit.augment.validate import Validation
     from sart_toolkit.backends.interface import Backend, BackendFactory
     from sart_toolkit.benchmark.plans import Plan
+    from sart_toolkit.calibrate.calibration import Calibration
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
     from sart_toolkit.collision.world import CollisionWorld
-    from sart_toolkit.data.formats.format import Format, Given
+    from sart_toolkit.data.formats.format import Arm, Format, Given
     from sart_toolkit.evaluate.deploy import Deployment
     from sart_toolkit.evaluate.rollout import Film, Rollout
     from sart_toolkit.learn.policy import Policy
     from sart_toolkit.learn.skill import SkillConfig
     from sart_toolkit.learn.training import TrainConfig
+    from sart_toolkit.poses import Array
     from sart_toolkit.record.session import Device, DeviceSetup, SessionConfig
+    from sart_toolkit.robots.model import RobotModel
     from sart_toolkit.robots.spec import ImageSize, RobotSpec
     from sart_toolkit.scenes.spec import SceneSpec
     from sart_toolkit.tasks.task import Placement, Task
@@ -939,6 +942,13 @@ def import_recordings(
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
     gripper_range: tuple[float, float] | None = None,
+    calibrations: Sequence[Calibration] = (),
+    intrinsics: Mapping[str, Array] | None = None,
+    cameras: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    rotation: str | None = None,
+    pose_frame: str | None = None,
+    episode: int | None = None,
     overwrite: bool = False,
     progress: Progress = _silent,
 ) -> list[Path]:
@@ -950,11 +960,20 @@ def import_recordings(
         format: what it is; found out if left out.
         task, robot: what it is of, where the file doesn't say so.
         gripper_range: what the file has for an open and for a closed gripper, where it doesn't say.
+        calibrations: of cameras, where the file says neither mounting nor intrinsics.
+        intrinsics: `(3, 3)` [pixels] by camera, where it doesn't say them.
+        cameras: which to take, our name of each with the file's; all by their own if left out.
+        columns: where a LeRobot dataset has `joints` or `tool_pose`, `gripper`, and these after
+            `commanded_`, each as `COLUMN[A:B]`.
+        rotation: how it has the rotations of `tool_pose`: rotvec, rpy, wxyz, xyzw or 6d.
+        pose_frame: whose pose `tool_pose` is in the robot's base, a link of its URDF, or "tool".
+        episode: the one to take of several, in the file `out`.
         overwrite: whether earlier files may be replaced.
         progress: called with the recordings done.
 
     Raises:
-        UnknownName: the format, the task or the robot can't be found.
+        UnknownName: the format, the task, the robot, a camera, a column or the frame can't be
+            found.
         MissingFile, BrokenFile: it can't be read, or is of no format that is read.
         InvalidInput: the format isn't read, or something is said neither by the file nor here.
         OutputExists, CannotWrite: as `check_writable` and `save_demonstration`.
@@ -967,8 +986,18 @@ def import_recordings(
     from sart_toolkit.data.formats.format import reader_of
 
     reader, found = reader_of(path, None if format is None else get_format(format))
-    given = _given(task, robot, gripper_range)
-    single = found == [path]
+    if episode is not None:
+        if not 0 <= episode < len(found):
+            raise InvalidInput(f"episode: expected 0 to {len(found) - 1}, got {episode}")
+        found = [found[episode]]
+    given = dataclasses.replace(
+        _given(task, robot, pose_frame, calibrations, intrinsics or {}),
+        gripper_range=gripper_range,
+        camera_names=cameras or {},
+        columns=columns or {},
+        rotation=rotation,
+    )
+    single = episode is not None or found == [path]
     paths = [out] if single else [demonstration_path(out, i) for i in range(len(found))]
     for i, (recording, target) in enumerate(zip(found, paths, strict=True)):
         with OutputLock(target):
@@ -978,23 +1007,63 @@ def import_recordings(
 
 
 def _given(
-    task: TaskLike | None, robot: RobotLike | None, gripper_range: tuple[float, float] | None
+    task: TaskLike | None,
+    robot: RobotLike | None,
+    pose_frame: str | None,
+    calibrations: Sequence[Calibration],
+    intrinsics: Mapping[str, Array],
 ) -> Given:
     """What a person says of a recording, with the kinematics of the robot."""
     from sart_toolkit.data.formats.format import Given
 
-    said: dict[str, Any] = {"gripper_range": gripper_range}
     given = {"task": task, "robot": robot}
     found = {k: reference_to(k, v, _TABLES[k]) for k, v in given.items() if v is not None}
-    references = {kind: reference for kind, reference in found.items() if reference is not None}
+    said: dict[str, Any] = {
+        "references": {kind: ref for kind, ref in found.items() if ref is not None},
+        "cameras": {},
+        "intrinsics": {},
+    }
     if task is not None:
         said["task"] = get_task(task).name
     if robot is not None:
         from sart_toolkit.robots.model import RobotModel
 
         model = RobotModel(get_robot(robot))
-        said |= {"robot": model.spec.name, "fk": model.fk, "cameras": model.mounted_cameras()}
-    return Given(references=references, **said)
+        said |= {"robot": model.spec.name, "arm": _arm(model, pose_frame)}
+        said["cameras"] |= model.mounted_cameras()
+    elif pose_frame is not None:
+        raise InvalidInput("--pose-frame: is a frame of the robot; add --robot REF")
+    # What was measured comes before what the robot's specification says.
+    for calibration in calibrations:
+        said["cameras"][calibration.camera] = calibration.frame, calibration.T_frame_camera
+        said["intrinsics"][calibration.camera] = calibration.intrinsics_of
+    for name, K in intrinsics.items():
+        if name in said["intrinsics"]:
+            raise InvalidInput(f"--camera-intrinsics {name}: --calibration says them; leave it out")
+        said["intrinsics"][name] = functools.partial(_constant, K)
+    return Given(**said)
+
+
+def _constant(K: Array, width: int, height: int) -> Array:
+    return K
+
+
+def _arm(model: RobotModel, pose_frame: str | None) -> Arm:
+    """A robot's kinematics, and where the tool is in a frame of its URDF."""
+    from sart_toolkit.data.formats.format import Arm
+    from sart_toolkit.poses import inverse
+
+    home = np.array(model.spec.home)
+    T_frame_tool = None
+    if pose_frame is not None:
+        frame = model.spec.tool_frame if pose_frame == "tool" else pose_frame
+        if model.mount_of(frame) != "tool":
+            raise InvalidInput(
+                f"--pose-frame {pose_frame}: doesn't move with the tool; name the flange or a link "
+                "beyond it"
+            )
+        T_frame_tool = inverse(model.fk(home, frame)) @ model.fk(home)
+    return Arm(model.fk, model.ik, home, model.spec.T_world_base, T_frame_tool)
 
 
 def check_export(path: Path, format: FormatLike) -> Sequence[str]:

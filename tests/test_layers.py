@@ -19,6 +19,7 @@ LAYERS = (
     "data",
     "workers",
     "robots",
+    "calibrate",
     "scenes",
     "collision",
     "motion",

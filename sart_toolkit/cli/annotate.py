@@ -40,7 +40,7 @@ _WITHOUT = "or work without a window: --text, or --suggest-all --no-window"
 def annotate_verb(args: Annotate) -> dict[str, Any]:
     """`sart annotate`."""
     pipeline.check_names(task=args.task, robot=args.robot)
-    sensor = declared_sensor(args)
+    sensor = declared_sensor(args, [args.demo])
     headless = args.no_window and not args.text
     if headless and not args.suggest_all:
         raise InvalidInput("--no-window: leaves nothing to do; add --suggest-all, or --text")

@@ -6,16 +6,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from tyro.conf import Positional, arg
 
 from sart_toolkit.augment import STRATEGIES
 from sart_toolkit.data.formats import FORMATS
 from sart_toolkit.errors import InvalidInput
+from sart_toolkit.poses import Array
 
 
 def _optional(metavar: str, help: str) -> Any:
     """A flag that may be left out, what happens then being in its help."""
     return arg(metavar=metavar, help=help, help_behavior_hint="")
+
+
+def _several(metavar: str, help: str) -> Any:
+    """A flag that takes several values, or may be left out."""
+    return arg(metavar=f"{metavar} [{metavar} ...]", help=help, help_behavior_hint="")
 
 
 def whole_numbers(flag: str, text: str) -> tuple[int, ...]:
@@ -30,6 +37,21 @@ def whole_numbers(flag: str, text: str) -> tuple[int, ...]:
         raise InvalidInput(
             f"--{flag}: expected whole numbers separated by commas, got {text!r}"
         ) from error
+
+
+def intrinsics_of(flag: str, text: str) -> Array:
+    """The matrix `(3, 3)` of "FX,FY,CX,CY".
+
+    Raises:
+        InvalidInput: it is something else.
+    """
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError as error:
+        raise InvalidInput(
+            f"{flag}: expected FX,FY,CX,CY in pixels as in 606,606,319.5,239.5, got {text!r}"
+        ) from error
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 _JSON = Annotated[bool, arg(name="json", help="Print the result as one JSON object on stdout.")]
@@ -150,6 +172,14 @@ _DEPTH_SCALE = Annotated[
     float | None,
     _optional(
         "PERCENT", "With --source cloud: largest error of the depth's scale; none if left out."
+    ),
+]
+_CALIBRATION = Annotated[
+    tuple[Path, ...],
+    _several(
+        "JSON",
+        "With --source cloud: files from `sart calibrate`, one for each camera with depth, whose "
+        "errors are declared in place of --hand-eye-error; none if left out.",
     ),
 ]
 _TOOL_MARGIN = Annotated[float, arg(help="Distance kept free around the tool [m].")]
@@ -302,6 +332,67 @@ class Play:
 
 
 @dataclass(frozen=True)
+class Calibrate:
+    """Find where a camera is mounted, and how far it may be off, from images of a printed board.
+
+    Example: sart calibrate --board board.pdf
+
+    Example: sart calibrate pictures --out wrist.json
+
+    Example: sart calibrate pictures --out wrist.json --intrinsics 606,606,319.5,239.5
+
+    Example: sart calibrate board.h5 --out wrist.json --square-mm 30 --marker-mm 22
+
+    Example: sart calibrate pictures --out overview.json --camera overview --mount world
+
+    Print the board in true size, lay it flat, and take 15 to 25 images of it from all sides, tilted
+    by 15 to 30 degrees. A folder holds poses.csv beside the images, as docs/calibration.md has it;
+    a demonstration (.h5) has both. A camera that stands in the world looks at a board in the
+    gripper.
+    """
+
+    source: Annotated[
+        Positional[Path | None],
+        arg(
+            metavar="SOURCE",
+            help="Folder with images and poses.csv, or a demonstration that shows the board.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    out: Annotated[Path | None, _optional("PATH", "JSON file to write.")] = None
+    board: Annotated[
+        Path | None,
+        _optional("PATH", "Write the board instead, as .pdf or .png to print in true size."),
+    ] = None
+    camera: Annotated[str, arg(help="The camera's name.")] = "wrist"
+    mount: Annotated[
+        Literal["tool", "world"] | None,
+        _optional(
+            "{tool,world}",
+            "What the camera is mounted on; what a demonstration notes, or tool, if left out.",
+        ),
+    ] = None
+    intrinsics: Annotated[
+        str | None,
+        _optional(
+            "FX,FY,CX,CY",
+            "Pinhole intrinsics of the images [pixels], or estimate; what a demonstration "
+            "recorded, or estimated, if left out.",
+        ),
+    ] = None
+    robot: Annotated[
+        str | None,
+        _optional("REF", f"Robot, as {_REF}, whose joints poses.csv has; none if it has poses."),
+    ] = None
+    squares: Annotated[str, arg(help="Squares of the board, columns and rows.")] = "9x7"
+    square_mm: Annotated[float, arg(help="Edge of a square, as measured [mm].")] = 25.0
+    marker_mm: Annotated[float, arg(help="Edge of a marker [mm].")] = 18.0
+    dictionary: Annotated[str, arg(help="OpenCV's name of the markers.")] = "DICT_4X4_50"
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
 class Suggest:
     """Suggest precision spheres for a demonstration, as a file that you can edit.
 
@@ -313,6 +404,9 @@ class Suggest:
 
     Example: sart suggest demo.h5 --out annotation.json --source cloud --sensor d405
         --hand-eye-error 2,0.3
+
+    Example: sart suggest demo.h5 --out annotation.json --source cloud --sensor d405
+        --calibration wrist.json
     """
 
     demo: Annotated[Positional[Path], arg(metavar="DEMO", help="Demonstration from `sart record`.")]
@@ -332,6 +426,7 @@ class Suggest:
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
     depth_scale_error: _DEPTH_SCALE = None
+    calibration: _CALIBRATION = ()
     margin: _TOOL_MARGIN = 0.0008
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
@@ -375,6 +470,7 @@ class Annotate:
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
     depth_scale_error: _DEPTH_SCALE = None
+    calibration: _CALIBRATION = ()
     margin: _TOOL_MARGIN = 0.0008
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
@@ -455,6 +551,7 @@ class Augment:
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
     depth_scale_error: _DEPTH_SCALE = None
+    calibration: _CALIBRATION = ()
     margin: Annotated[
         float,
         arg(
@@ -619,26 +716,39 @@ class Export:
 
 @dataclass(frozen=True)
 class Import:
-    """Make demonstrations of recordings in a format of the field: RMB, both variants.
+    """Make demonstrations of recordings in a format of the field: RMB, both variants, or LeRobot.
 
     Example: sart import peg_in_hole_0000.rmb --out demo.h5
 
     Example: sart import recordings --out demos
 
     Example: sart import cable.rmb --out demo.h5 --task cable.py:Cable --robot my_ur5e.py:UR5E
-        --gripper-range 0,255
+        --gripper-range 0,255 --calibration wrist.json
+
+    Example: sart import lerobot_cable --episode 3 --out demo.h5 --task cable.py:Cable
+        --robot my_ur5e.py:UR5E --columns tool_pose=observation.state[0:6]
+        gripper=observation.state[6] commanded_gripper=action[6] --rotation rotvec
+        --pose-frame tool0 --gripper-range 0,1 --cameras wrist=hand --calibration wrist.json
 
     What a file doesn't say has to be said: of a recording from elsewhere the task, the robot (its
-    tool frame, and where its cameras are mounted), and the range of its gripper.
+    tool frame), where cameras are mounted and their intrinsics, the range of its gripper, and of
+    LeRobot which columns hold what.
     """
 
     file: Annotated[
         Positional[Path],
-        arg(metavar="FILE", help="A recording, .rmb or .hdf5, or a directory of several."),
+        arg(
+            metavar="FILE",
+            help="A recording, .rmb or .hdf5, a directory of several, or a LeRobot dataset.",
+        ),
     ]
     out: Annotated[Path, arg(help="HDF5 file to write; of several, the directory of as many.")]
     format: Annotated[
         str | None, _optional("REF", "Format, as for export; found out if left out.")
+    ] = None
+    episode: Annotated[
+        int | None,
+        _optional("INT", "Which one to take of several, from 0; all if left out."),
     ] = None
     task: Annotated[
         str | None, _optional("REF", f"Task, as {_REF}, where the file doesn't say it.")
@@ -652,6 +762,44 @@ class Import:
             "OPEN,CLOSED",
             "What the file has for an open and for a closed gripper, such as 0,255, where it "
             "doesn't say it.",
+        ),
+    ] = None
+    cameras: Annotated[
+        tuple[str, ...],
+        _several(
+            "NAME=THEIRS",
+            "Cameras to take, our name of each with the file's; all by their own if left out.",
+        ),
+    ] = ()
+    calibration: Annotated[
+        tuple[Path, ...],
+        _several("JSON", "Files from `sart calibrate`: cameras' mounting and intrinsics."),
+    ] = ()
+    camera_intrinsics: Annotated[
+        tuple[str, ...],
+        _several(
+            "NAME=FX,FY,CX,CY", "Cameras' intrinsics [pixels], where no calibration has them."
+        ),
+    ] = ()
+    columns: Annotated[
+        tuple[str, ...],
+        _several(
+            "NAME=COLUMN",
+            "Of LeRobot: the columns of joints [rad] or tool_pose (position [m], rotation), and "
+            "gripper; also of joint_velocities, commanded_joints or commanded_tool_pose, and "
+            "commanded_gripper, as measured if left out. Parts as COLUMN[A:B] or COLUMN[I].",
+        ),
+    ] = ()
+    rotation: Annotated[
+        Literal["rotvec", "rpy", "wxyz", "xyzw", "6d"] | None,
+        _optional("{rotvec,rpy,wxyz,xyzw,6d}", "Of LeRobot: how tool_pose has its rotation."),
+    ] = None
+    pose_frame: Annotated[
+        str | None,
+        _optional(
+            "FRAME",
+            "Of LeRobot: what tool_pose is the pose of, in the robot's base: a link of its URDF, "
+            "or tool.",
         ),
     ] = None
     overwrite: _OVERWRITE = False

@@ -23,11 +23,11 @@ from sart_toolkit.errors import InvalidInput, Mismatch
 
 def augment_verb(args: Augment) -> dict[str, Any]:
     """`sart augment`."""
-    sensor = declared_sensor(args)
     annotations = [path for path in args.files if path.suffix == ".json"]
     demos = [path for path in args.files if path not in annotations]
     if not demos:
         raise InvalidInput("FILE: expected a demonstration, got annotations alone; add its .h5")
+    sensor = declared_sensor(args, demos)
     options: dict[str, Any] = {
         "task": args.task,
         "robot": args.robot,

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 from sart_toolkit import pipeline
-from sart_toolkit.cli.arguments import Export, Import, Validate
+from sart_toolkit.calibrate.calibration import load_calibration
+from sart_toolkit.cli.arguments import Export, Import, Validate, intrinsics_of
 from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.errors import InvalidInput, Mismatch
 
@@ -38,6 +40,16 @@ def import_verb(args: Import) -> dict[str, Any]:
             task=args.task,
             robot=args.robot,
             gripper_range=None if args.gripper_range is None else _range(args.gripper_range),
+            calibrations=[load_calibration(path) for path in args.calibration],
+            intrinsics={
+                name: intrinsics_of("--camera-intrinsics", text)
+                for name, text in _named("camera-intrinsics", args.camera_intrinsics).items()
+            },
+            cameras=_named("cameras", args.cameras),
+            columns=_named("columns", args.columns),
+            rotation=args.rotation,
+            pose_frame=args.pose_frame,
+            episode=args.episode,
             overwrite=args.overwrite,
             progress=progress,
         )
@@ -59,6 +71,23 @@ def check_verb(args: Validate, format: str) -> dict[str, Any]:
             f"{args.dataset}: {len(problems)} problem(s) as {format}; fix them or write it again"
         )
     return {"dataset": str(args.dataset), "format": format, "problems": 0}
+
+
+def _named(flag: str, words: Sequence[str]) -> dict[str, str]:
+    """What follows `=` in each word, by what stands before it.
+
+    Raises:
+        InvalidInput: a word has no `=`, or a name comes twice.
+    """
+    found: dict[str, str] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name and equals and value):
+            raise InvalidInput(f"--{flag}: expected NAME=VALUE, got {word!r}")
+        if name in found:
+            raise InvalidInput(f"--{flag}: {name} is given twice; leave one out")
+        found[name] = value
+    return found
 
 
 def _range(text: str) -> tuple[float, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Protocol
 
 from sart_toolkit.collision.sensor import SensorErrors, sensor_errors
@@ -27,17 +29,25 @@ class SensorFlags(Protocol):
     def depth_scale_error(self) -> float | None:
         """In percent."""
 
+    @property
+    def calibration(self) -> tuple[Path, ...]:
+        """Files from `sart calibrate`."""
 
-def declared_sensor(flags: SensorFlags) -> SensorErrors | None:
-    """The errors that the flags declare; None if none of them was given.
+
+def declared_sensor(flags: SensorFlags, demos: Sequence[Path]) -> SensorErrors | None:
+    """The errors that the flags declare of demonstrations' cameras; None if none was given.
 
     Raises:
-        InvalidInput: they are given for obstacles from the scene, or can't be read.
+        InvalidInput: they are given for obstacles from the scene, can't be read, or contradict
+            each other.
+        MissingFile, BrokenFile: a calibration or a demonstration can't be read.
+        Mismatch: a calibration is not that of a demonstration's camera.
     """
     given = {
         "--sensor": flags.sensor,
         "--hand-eye-error": flags.hand_eye_error,
         "--depth-scale-error": flags.depth_scale_error,
+        "--calibration": flags.calibration or None,
     }
     names = [name for name, value in given.items() if value is not None]
     if not names:
@@ -46,10 +56,30 @@ def declared_sensor(flags: SensorFlags) -> SensorErrors | None:
         raise InvalidInput(
             f"{names[0]}: is about the recorded RGB-D; add --source cloud, or leave it out"
         )
-    scale = flags.depth_scale_error or 0.0
-    return sensor_errors(
-        flags.sensor or "exact", _hand_eye(flags.hand_eye_error or "0,0"), scale / 100
-    )
+    hand_eye, scale = _hand_eye(flags.hand_eye_error or "0,0"), flags.depth_scale_error
+    depth_scale = None if scale is None else scale / 100
+    if flags.calibration:
+        if flags.hand_eye_error is not None:
+            raise InvalidInput("--hand-eye-error: --calibration declares it; leave one out")
+        hand_eye, calibrated = _calibrated(flags.calibration, demos)
+        if calibrated is not None and depth_scale is not None:
+            raise InvalidInput("--depth-scale-error: --calibration declares it; leave this out")
+        depth_scale = depth_scale if calibrated is None else calibrated
+    return sensor_errors(flags.sensor or "exact", hand_eye, depth_scale or 0.0)
+
+
+def _calibrated(
+    files: Sequence[Path], demos: Sequence[Path]
+) -> tuple[tuple[float, float], float | None]:
+    """What the cameras of demonstrations are off by, as their calibrations have it."""
+    from sart_toolkit.calibrate.calibration import declared_errors, load_calibration
+    from sart_toolkit.data.storage import load_demonstration
+
+    calibrations = [load_calibration(path) for path in files]
+    found = [declared_errors(load_demonstration(path), calibrations) for path in demos]
+    scales = [errors.depth_scale for errors in found if errors.depth_scale is not None]
+    hand_eye = max(e.hand_eye for e in found), max(e.hand_eye_deg for e in found)
+    return hand_eye, max(scales) if len(scales) == len(found) else None
 
 
 def _hand_eye(text: str) -> tuple[float, float]:

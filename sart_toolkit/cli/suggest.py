@@ -13,7 +13,7 @@ from sart_toolkit.data.records import Annotation
 
 def suggest_verb(args: Suggest) -> dict[str, Any]:
     """`sart suggest`."""
-    sensor = declared_sensor(args)
+    sensor = declared_sensor(args, [args.demo])
     with ProgressDisplay() as progress:
         annotation = pipeline.suggest(
             args.demo,

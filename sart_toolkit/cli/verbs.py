@@ -48,6 +48,7 @@ VERBS: Mapping[str, Verb] = {
     "run": Verb(arguments.Run, "sart_toolkit.cli.run:run_verb"),
     "record": Verb(arguments.Record, "sart_toolkit.cli.record:record_verb"),
     "play": Verb(arguments.Play, "sart_toolkit.cli.play:play_verb"),
+    "calibrate": Verb(arguments.Calibrate, "sart_toolkit.cli.calibrate:calibrate_verb"),
     "suggest": Verb(arguments.Suggest, "sart_toolkit.cli.suggest:suggest_verb"),
     "annotate": Verb(arguments.Annotate, "sart_toolkit.cli.annotate:annotate_verb"),
     "augment": Verb(arguments.Augment, "sart_toolkit.cli.augment:augment_verb"),

@@ -210,6 +210,29 @@ class EvaluationFile(msgspec.Struct):
     versions: dict[str, str] = {}
 
 
+class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A camera's calibration."""
+
+    kind: Literal["calibration"]
+    camera: Name
+    frame: Literal["tool", "world"]
+    T_frame_camera: Matrix
+    intrinsics: Matrix
+    image_size: tuple[int, int]
+    hand_eye: float
+    hand_eye_deg: float
+    axis_errors: tuple[float, float, float]
+    axis_errors_deg: tuple[float, float, float]
+    square_scale: float
+    rms_pixels: float
+    views: Count
+    board: Values
+    left_out: list[str]
+    depth_scale: float | None
+    depth_scale_error: float | None
+    versions: dict[str, str]
+
+
 class RunFile(msgspec.Struct):
     """`run.json`."""
 

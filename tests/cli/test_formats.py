@@ -106,7 +106,7 @@ def test_mistakes_are_one_line(demo, tmp_path, refused, said):
         "import", demo, "--out", out, "--gripper-range", "3"
     )
     assert "holds no recording of" in refused("import", demo, "--out", out)
-    assert "isn't imported" in refused("import", demo, "--out", out, "--format", "lerobot")
+    assert "isn't imported" in refused("import", demo, "--out", out, "--format", "zarr")
     assert "--replay: is about datasets of ours" in refused(
         "validate", demo, "--format", "rmb", "--replay"
     )

@@ -19,7 +19,7 @@ from sart_toolkit.errors import InvalidInput
 
 def parsed(words, of=Suggest):
     start = "demo.h5 --out a.json" if of is Suggest else "demo.h5 a.json --out data"
-    return declared_sensor(Verb(of, "").parse("verb", (start + " " + words).split()))
+    return declared_sensor(Verb(of, "").parse("verb", (start + " " + words).split()), [])
 
 
 @pytest.mark.parametrize("of", [Suggest, Augment])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,18 +19,22 @@ from scipy.spatial.transform import Rotation
 from sart_toolkit.data.dataset import Dataset, Source, count_demonstrations
 from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.records import (
+    DEFAULT_RATES,
     CameraFrame,
     CameraRecord,
     Demonstration,
     Episode,
+    Rates,
     Steps,
     actions_from_commands,
     library_versions,
 )
-from sart_toolkit.errors import BrokenFile, InvalidInput
-from sart_toolkit.poses import Array
+from sart_toolkit.errors import BrokenFile, InvalidInput, unknown_name
+from sart_toolkit.poses import Array, StraightLine, check_poses, relative_motion
 
 ACTION_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
+# How much a step's time may be off the recording's period, as a fraction of it.
+_UNEVEN = 0.5
 # Position, then the first two columns of the rotation matrix.
 POSE_NAMES = ("x", "y", "z", "r00", "r10", "r20", "r01", "r11", "r21")
 
@@ -121,21 +127,213 @@ class Format(abc.ABC):
 
 
 @dataclass(frozen=True)
+class Arm:
+    """The kinematics of the robot that made a recording.
+
+    `fk` maps joints `(n,)` to the tool's pose `(4, 4)` in the world; `ik` a pose and joints near it
+    to joints, at `home (n,)` at first; `T_world_base (4, 4)`: where its base is. `T_frame_tool`:
+    where the tool is in the frame whose poses the file has; None where nobody says which it is.
+    """
+
+    fk: Callable[[Array], Array]
+    ik: Callable[[Array, Array], Array]
+    home: Array
+    T_world_base: Array
+    T_frame_tool: Array | None = None
+
+    def inverse(self, Ts_world_tool: Array) -> Array:
+        """Joints `(n, j)` along tool poses `(n, 4, 4)`, each from those of the pose before.
+
+        Raises:
+            Unreachable, InvalidInput: a pose can't be reached, or isn't one.
+        """
+        q = [self.home]
+        for T in Ts_world_tool:
+            q.append(self.ik(T, q[-1]))
+        return np.array(q[1:])
+
+
+@dataclass(frozen=True)
 class Given:
     """What a person says of a recording that is imported, used only where the file doesn't say it.
 
     `task`, `robot`: their names; `references` of them, see `Demonstration`; `gripper_range`: what
-    the file has for an open and for a closed gripper; `fk` maps joints `(n,)` to the tool's pose
-    `(4, 4)`; `cameras`: what each is mounted on and where, by name. `None` or nothing where nobody
-    says it either.
+    the file has for an open and for a closed gripper; `arm`: the robot's kinematics; `cameras`:
+    what each is mounted on and where, by name; `intrinsics` maps the width and height of a camera's
+    images to its intrinsics `(3, 3)`; `camera_names`: which are read, our name of each with the
+    file's own; `columns`: where in the file what the key names is, such as `joints`, as
+    `COLUMN[A:B]`; `rotation`: how the file's poses have theirs, a key of `ROTATIONS`. `None` or
+    nothing where nobody says it either.
     """
 
     task: str | None = None
     robot: str | None = None
     references: Mapping[str, str] = dataclasses.field(default_factory=dict)
     gripper_range: tuple[float, float] | None = None
-    fk: Callable[[Array], Array] | None = None
+    arm: Arm | None = None
     cameras: Mapping[str, tuple[CameraFrame, Array]] = dataclasses.field(default_factory=dict)
+    intrinsics: Mapping[str, Callable[[int, int], Array]] = dataclasses.field(default_factory=dict)
+    camera_names: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    columns: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    rotation: str | None = None
+
+    def check_unsaid(self, fields: Sequence[str], why: str) -> None:
+        """Return if nothing is given that the file says itself, or has no use for.
+
+        Raises:
+            InvalidInput: something is.
+        """
+        for name in fields:
+            if getattr(self, name):
+                flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
+                raise InvalidInput(f"{why}; leave {flag} out")
+
+    def chosen_cameras(self, there: Sequence[str]) -> dict[str, str]:
+        """The cameras to read: our name of each, and the file's.
+
+        Raises:
+            UnknownName: the file hasn't one that is named.
+            InvalidInput: intrinsics are given of one that isn't read.
+        """
+        for theirs in self.camera_names.values():
+            if theirs not in there:
+                raise unknown_name("camera", theirs, there)
+        chosen = dict(self.camera_names) or {name: name for name in there}
+        for name in self.intrinsics:
+            if name not in chosen:
+                raise InvalidInput(
+                    f"camera {name!r}: has a calibration or intrinsics but isn't in the recording, "
+                    f"which has {', '.join(there) or 'none'}; add --cameras {name}=THEIRS"
+                )
+        return chosen
+
+    def mounting(self, name: str) -> tuple[CameraFrame, Array]:
+        """What a camera is mounted on, and its pose `(4, 4)` there.
+
+        Raises:
+            InvalidInput: nobody says it.
+        """
+        if name not in self.cameras:
+            raise InvalidInput(
+                f"camera {name!r}: where it is mounted isn't said; add --calibration FILE, or "
+                f"--robot REF of a robot that has a camera {name!r}; or leave it out: --cameras"
+            )
+        return self.cameras[name]
+
+    def intrinsics_of(self, name: str, width: int, height: int) -> Array:
+        """A camera's intrinsics `(3, 3)`.
+
+        Raises:
+            InvalidInput: nobody says them.
+            Mismatch: they are of images of another shape.
+        """
+        if name not in self.intrinsics:
+            raise InvalidInput(
+                f"camera {name!r}: its intrinsics aren't said; add --calibration FILE, or "
+                f"--camera-intrinsics {name}=FX,FY,CX,CY"
+            )
+        return self.intrinsics[name](width, height)
+
+    def gripper(self, values: Array) -> Array:
+        """Gripper values as ours, from 0 (open) to 1 (closed).
+
+        Raises:
+            InvalidInput: nobody says which of them are open and closed.
+        """
+        if self.gripper_range is None:
+            raise InvalidInput(
+                f"gripper values reach from {values.min():g} to {values.max():g}, and which are "
+                "open and closed isn't said; add --gripper-range OPEN,CLOSED"
+            )
+        open_, closed = self.gripper_range
+        if open_ == closed:
+            raise InvalidInput(f"gripper_range: expected two numbers, got {open_:g} twice")
+        return np.clip((values - open_) / (closed - open_), 0.0, 1.0)
+
+
+# What the toolkit's own exports say themselves.
+SAID_BY_OURS = ("task", "robot", "gripper_range", "cameras", "intrinsics", "columns", "rotation")
+_FLAGS = {"cameras": "--calibration", "intrinsics": "--calibration or --camera-intrinsics"}
+
+# How many numbers a rotation has in a file, and the rotation that they are.
+ROTATIONS: Mapping[str, tuple[int, Callable[[Array], Rotation]]] = {
+    "rotvec": (3, Rotation.from_rotvec),
+    "rpy": (3, lambda r: Rotation.from_euler("xyz", r)),
+    "wxyz": (4, lambda r: Rotation.from_quat(r, scalar_first=True)),
+    "xyzw": (4, Rotation.from_quat),
+    "6d": (6, lambda r: Rotation.from_matrix(_of_two_columns(r))),
+}
+
+
+def _of_two_columns(r: Array) -> Array:
+    """Rotation matrices `(n, 3, 3)` of their first two columns `(n, 6)`, made orthonormal."""
+    x = r[:, :3] / np.linalg.norm(r[:, :3], axis=1, keepdims=True)
+    y = r[:, 3:] - (x * r[:, 3:]).sum(axis=1, keepdims=True) * x
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    return np.stack([x, y, np.cross(x, y)], axis=2)
+
+
+def poses_of(rows: Array, rotation: str) -> Array:
+    """Poses `(n, 4, 4)` of rows `(n, k)`: position [m], then the rotation.
+
+    Raises:
+        InvalidInput: the rows have another width, or a rotation is none.
+    """
+    width, convert = ROTATIONS[rotation]
+    if rows.shape[1] != 3 + width:
+        raise InvalidInput(
+            f"tool_pose: rows of {rows.shape[1]} numbers, expected 3 and {width} for {rotation}"
+        )
+    Ts = np.tile(np.eye(4), (len(rows), 1, 1))
+    Ts[:, :3, 3] = rows[:, :3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        try:
+            Ts[:, :3, :3] = convert(rows[:, 3:]).as_matrix()
+        except ValueError as error:
+            raise InvalidInput(f"tool_pose: a rotation that is none ({error})") from error
+    return check_poses("tool_pose", Ts)
+
+
+def commands_along(Ts_world_tool: Array, gripper: Array, rates: Rates) -> Array:
+    """Tool velocities and gripper targets `(m, 7)` that lead along commanded poses.
+
+    One for each control period, as an operator would have given them, straight from a step to the
+    next; without them a robot couldn't follow the recording.
+
+    Args:
+        Ts_world_tool: the commanded poses `(n, 4, 4)`.
+        gripper: the commanded gripper `(n,)`.
+        rates: how often it is commanded and recorded.
+    """
+    parts, rows = rates.control_per_record, []
+    for T_from, T_to, target in zip(
+        Ts_world_tool[:-1], Ts_world_tool[1:], gripper[1:], strict=True
+    ):
+        line = StraightLine(T_from, T_to)
+        Ts = [line(i / parts) for i in range(parts + 1)]
+        for a, b in itertools.pairwise(Ts):
+            rows.append([*(relative_motion(a, b) * rates.control_hz), target])
+    return np.array(rows).reshape(-1, 7)
+
+
+def even_rates(time: Array) -> Rates:
+    """The rate of a recording by its times `(n,)` [s], with those at which it is executed again.
+
+    How often it was commanded isn't known; a robot that follows it is commanded in as many even
+    steps as come to the default rates or more.
+
+    Raises:
+        InvalidInput: they are uneven.
+    """
+    period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    hz = round(1 / period) if period > 0 else 0
+    if hz < 1 or np.abs(np.diff(time) * hz - 1).max() > _UNEVEN:
+        raise InvalidInput(
+            "time: steps are missing or uneven, or fewer than one a second; cut the recording"
+        )
+    control_hz = hz * math.ceil(DEFAULT_RATES.control_hz / hz)
+    physics_hz = control_hz * math.ceil(DEFAULT_RATES.physics_hz / control_hz)
+    return Rates(physics_hz, control_hz, hz)
 
 
 class Reads(Format):
@@ -143,7 +341,10 @@ class Reads(Format):
 
     @abc.abstractmethod
     def recordings(self, path: Path) -> Sequence[Path]:
-        """The single recordings of this format in a path, or the path alone; none of others."""
+        """The single recordings of this format in a path, or the path alone; none of others.
+
+        Where a file holds several, each has a path that `read` takes, though no file is there.
+        """
 
     @abc.abstractmethod
     def read(self, path: Path, given: Given) -> Demonstration:

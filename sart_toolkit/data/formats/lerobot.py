@@ -1,4 +1,4 @@
-"""LeRobot dataset v3.0: parquet tables, MP4 videos and JSON, written without importing lerobot.
+"""LeRobot dataset v3.0: parquet tables, MP4 videos and JSON, without importing lerobot.
 
 A policy of LeRobot takes `observation.state` and the images. As in SART's own policies, the state
 is the gripper alone; joints and poses are there under names that such a policy leaves aside.
@@ -20,12 +20,14 @@ from sart_toolkit.data.formats.format import (
     CONVENTIONS,
     POSE_NAMES,
     About,
-    Format,
+    Given,
+    Reads,
     Trajectory,
     pose_rows,
 )
 from sart_toolkit.data.formats.statistics import LevelStatistics, RowStatistics
 from sart_toolkit.data.formats.video import Codec, VideoWriter, best_codec, required
+from sart_toolkit.data.records import Demonstration
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array
 
@@ -87,7 +89,7 @@ def depth_of_levels(levels: NDArray[Any]) -> Array:
     return depth
 
 
-class LeRobot(Format):
+class LeRobot(Reads):
     """LeRobot dataset v3.0, a directory."""
 
     name = "lerobot"
@@ -107,6 +109,16 @@ class LeRobot(Format):
         from sart_toolkit.data.formats.lerobot_check import problems
 
         return problems(path)
+
+    def recordings(self, path: Path) -> Sequence[Path]:
+        from sart_toolkit.data.formats.lerobot_read import recordings
+
+        return recordings(Path(path))
+
+    def read(self, path: Path, given: Given) -> Demonstration:
+        from sart_toolkit.data.formats.lerobot_read import read
+
+        return read(Path(path), given)
 
 
 def rows_of(trajectory: Trajectory, hz: int, with_force: bool) -> dict[str, NDArray[Any]]:

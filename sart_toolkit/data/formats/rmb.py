@@ -21,11 +21,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sart_toolkit.data.formats.format import (
+    SAID_BY_OURS,
     About,
     Given,
     Reads,
     Trajectory,
     all_problems,
+    commands_along,
+    even_rates,
+    poses_of,
     quaternions,
 )
 from sart_toolkit.data.formats.hdf5 import reading_hdf5, rows
@@ -37,7 +41,6 @@ from sart_toolkit.data.formats.video import (
     read_video,
 )
 from sart_toolkit.data.records import (
-    CameraFrame,
     CameraRecord,
     Demonstration,
     Image,
@@ -53,8 +56,6 @@ MAIN = "main.rmb.hdf5"
 _COMPACT, _SINGLE = "RmbData-Compact", "RmbData-SingleHDF5"
 _MARK = "sart.json"
 _NOT_UNIT = 1e-3
-# How much a step's time may be off the recording's period.
-_UNEVEN = 0.5
 _log = logging.getLogger(__name__)
 
 # Lossless, both: what is read is what was written.
@@ -261,10 +262,11 @@ class _Recording:
         text = file.attrs.get("sart")
         # What only the toolkit's own files say.
         self._ours: dict[str, Any] = {} if text is None else json.loads(text)
-        for what in ("task", "robot", "gripper_range") if self._ours else ():
-            if getattr(given, what) is not None:
-                flag = what.replace("_", "-")
-                raise InvalidInput(f"says itself what --{flag} would; leave that out")
+        given.check_unsaid(("columns", "rotation"), "has columns of fixed names")
+        if given.arm is not None and given.arm.T_frame_tool is not None:
+            raise InvalidInput("poses come from its joints; leave --pose-frame out")
+        if self._ours:
+            given.check_unsaid(SAID_BY_OURS, "says itself what this would")
         self._cameras = [str(name) for name in np.ravel(file.attrs.get("camera_names", []))]
 
     def demonstration(self) -> Demonstration:
@@ -273,6 +275,7 @@ class _Recording:
         n, ours = len(steps), self._ours
         time = rows(self._file, "time")[:, 0]
         provenance = ours.get("provenance", {})
+        rates = Rates(**ours["rates"]) if ours else even_rates(time)
         success = rows(self._file, "reward")[:, 0] > 0 if ours else np.zeros(n, bool)
         return Demonstration(
             task=self._said("task"),
@@ -284,13 +287,15 @@ class _Recording:
             body_Ts_world={},
             success=success,
             touching=((),) * n,
-            raw_commands=np.empty((0, 7)),
+            raw_commands=commands_along(
+                steps.commanded_Ts_world_tool, steps.commanded_gripper, rates
+            ),
             states=(),
             operator=provenance.get("operator", "unknown"),
             device="imported",
             seconds=0.0,
             versions=library_versions(),
-            rates=Rates(**ours["rates"]) if ours else self._rates(time),
+            rates=rates,
             judged_by="task" if ours else "nobody",
             references=ours.get("references", self._given.references),
         )
@@ -300,16 +305,6 @@ class _Recording:
         if found is None:
             raise InvalidInput(f"doesn't say which {what} it is of; add --{what} REF")
         return str(found)
-
-    def _rates(self, time: Array) -> Rates:
-        """The rate that the times tell; nothing else is known."""
-        period = float(np.median(np.diff(time)))
-        hz = round(1 / period) if period > 0 else 0
-        if hz < 1 or np.abs(np.diff(time) * hz - 1).max() > _UNEVEN:
-            raise InvalidInput(
-                "time: steps are missing or uneven, or fewer than one a second; cut the recording"
-            )
-        return Rates(hz, hz, hz)
 
     def _steps(self) -> Steps:
         file = self._file
@@ -333,7 +328,10 @@ class _Recording:
             measured_gripper=self._gripper(grippers[0][:, 0]),
             commanded_gripper=self._gripper(grippers[1][:, 0]),
             contact_force=force,
-            cameras={name: self._camera(name) for name in self._cameras},
+            cameras={
+                name: self._camera(name, theirs)
+                for name, theirs in self._given.chosen_cameras(self._cameras).items()
+            },
         )
 
     def _poses(self, which: str, q: Array) -> Array:
@@ -342,54 +340,35 @@ class _Recording:
         Others' end-effector is another frame than the tool, so that theirs come from the joints.
         """
         if not self._ours:
-            if self._given.fk is None:
+            if self._given.arm is None:
                 raise InvalidInput("its tool frame is known from the robot alone; add --robot REF")
-            return np.array([self._given.fk(row) for row in q])
-        told = rows(self._file, f"{which}_eef_pose")
-        Ts = np.tile(np.eye(4), (len(told), 1, 1))
-        Ts[:, :3, 3] = told[:, :3]
-        Ts[:, :3, :3] = Rotation.from_quat(told[:, 3:7], scalar_first=True).as_matrix()
-        return Ts
+            return np.array([self._given.arm.fk(row) for row in q])
+        return poses_of(rows(self._file, f"{which}_eef_pose"), "wxyz")
 
     def _gripper(self, values: Array) -> Array:
-        if self._ours:
-            return values
-        if self._given.gripper_range is None:
-            raise InvalidInput(
-                f"gripper values reach from {values.min():g} to {values.max():g}, and which are "
-                "open and closed isn't said; add --gripper-range OPEN,CLOSED"
-            )
-        open_, closed = self._given.gripper_range
-        if open_ == closed:
-            raise InvalidInput(f"gripper_range: expected two numbers, got {open_:g} twice")
-        return np.clip((values - open_) / (closed - open_), 0.0, 1.0)
+        return values if self._ours else self._given.gripper(values)
 
-    def _camera(self, name: str) -> CameraRecord:
-        rgb = self._images(name, "rgb")
+    def _camera(self, name: str, theirs: str) -> CameraRecord:
+        rgb = self._images(theirs, "rgb")
         if rgb is None:
-            raise BrokenFile(f"{self._path}: camera {name!r}: no images")
-        depth = self._images(name, "depth")
+            raise BrokenFile(f"{self._path}: camera {theirs!r}: no images")
+        depth = self._images(theirs, "depth")
         if depth is None:
-            _log.warning("%s: camera %r has no depth: as if nothing was hit", self._path, name)
+            _log.warning("%s: camera %r has no depth: as if nothing was hit", self._path, theirs)
             depth = np.zeros(rgb.shape[:3], np.float32)
-        frame: CameraFrame
-        ours = self._ours.get("provenance", {}).get("cameras", {}).get(name)
+        ours = self._ours.get("provenance", {}).get("cameras", {}).get(theirs)
         if ours is not None:
-            frame, T, intrinsics = ours["frame"], ours["T_frame_camera"], ours["intrinsics"]
-        elif name in self._given.cameras:
-            frame, T = self._given.cameras[name]
-            intrinsics = self._intrinsics(name, *rgb.shape[1:3])
+            frame, T, K = ours["frame"], ours["T_frame_camera"], np.asarray(ours["intrinsics"])
         else:
-            raise InvalidInput(
-                f"camera {name!r}: where it is mounted isn't said; add --robot REF of a robot that "
-                f"has a camera {name!r}"
-            )
-        return CameraRecord(rgb, depth, np.asarray(intrinsics), frame, np.asarray(T))
+            frame, T = self._given.mounting(name)
+            K = self._intrinsics(name, theirs, *rgb.shape[1:3])
+        return CameraRecord(rgb, depth, K, frame, np.asarray(T))
 
-    def _intrinsics(self, name: str, height: int, width: int) -> Array:
-        key = f"{name}_depth_image_fovy"
-        if key not in self._file.attrs:
-            raise InvalidInput(f"camera {name!r}: attribute {key} is missing")
+    def _intrinsics(self, name: str, theirs: str, height: int, width: int) -> Array:
+        """Those given, which may be measured ones, or those of the file's field of view."""
+        key = f"{theirs}_depth_image_fovy"
+        if name in self._given.intrinsics or key not in self._file.attrs:
+            return self._given.intrinsics_of(name, width, height)
         f = 0.5 * height / np.tan(0.5 * np.deg2rad(float(self._file.attrs[key])))
         return np.array([[f, 0, 0.5 * (width - 1)], [0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
 

@@ -213,8 +213,13 @@ def inspect_video(path: Path) -> VideoFacts:
         raise BrokenFile(f"{path}: can't be read as a video ({error})") from error
 
 
-def read_video(path: Path, pix_fmt: str) -> Iterator[NDArray[Any]]:
+def read_video(path: Path, pix_fmt: str, start: float = 0.0) -> Iterator[NDArray[Any]]:
     """The frames of a video in order, as arrays in a pixel format.
+
+    Args:
+        path: the file.
+        pix_fmt: the pixel format.
+        start: when the first one is shown [s].
 
     Raises:
         BrokenFile: it can't be read as a video.
@@ -222,7 +227,13 @@ def read_video(path: Path, pix_fmt: str) -> Iterator[NDArray[Any]]:
     av = required("av")
     try:
         with av.open(str(path)) as container:
-            for frame in container.decode(video=0):
-                yield frame.to_ndarray(format=pix_fmt)
+            stream = container.streams.video[0]
+            # Half a period early, as times are rounded.
+            first = start - 0.5 / float(stream.average_rate or 1)
+            if start > 0:
+                container.seek(int(max(first, 0.0) / stream.time_base), stream=stream)
+            for frame in container.decode(stream):
+                if frame.time is None or frame.time >= first:
+                    yield frame.to_ndarray(format=pix_fmt)
     except (av.FFmpegError, IndexError) as error:
         raise BrokenFile(f"{path}: can't be read as a video ({error})") from error

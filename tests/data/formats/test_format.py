@@ -19,7 +19,9 @@ from sart_toolkit.data.formats.format import (
     Format,
     Trajectory,
     about_dataset,
+    commands_along,
     counted,
+    even_rates,
     pose_rows,
     quaternions,
     reader_of,
@@ -29,7 +31,7 @@ from sart_toolkit.data.formats.transfer import export_dataset
 from sart_toolkit.data.records import apply_action
 from sart_toolkit.data.storage import save_demonstration
 from sart_toolkit.errors import BrokenFile, InvalidInput, OutputExists, UnknownName
-from sart_toolkit.poses import exp_rotation
+from sart_toolkit.poses import apply_motion, exp_rotation
 
 
 def written(dataset: Dataset, name: str, out: Path, **options: bool) -> None:
@@ -249,3 +251,24 @@ def test_quaternions_don_t_jump():
         expected = [0, np.sqrt(0.5), -np.sqrt(0.5), 0]
         np.testing.assert_allclose(quaternions(T[None], real="first")[0], expected, atol=1e-8)
     assert pose_rows(Ts).shape == (60, 9)
+
+
+def test_commands_along_a_recording_lead_from_each_of_its_poses_to_the_next(peg_demonstration):
+    steps, rates = peg_demonstration.steps, peg_demonstration.rates
+    rows = commands_along(steps.commanded_Ts_world_tool, steps.commanded_gripper, rates)
+    assert len(rows) == (len(steps) - 1) * rates.control_per_record
+    T = steps.commanded_Ts_world_tool[0]
+    for t in range(1, len(steps)):
+        for row in rows[(t - 1) * rates.control_per_record : t * rates.control_per_record]:
+            T = apply_motion(T, row[:6] / rates.control_hz)
+            assert row[6] == steps.commanded_gripper[t]
+        np.testing.assert_allclose(T, steps.commanded_Ts_world_tool[t], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("hz", "rates"),
+    [(10, (240, 30, 10)), (15, (240, 30, 15)), (20, (240, 40, 20)), (50, (250, 50, 50))],
+)
+def test_a_recording_is_executed_at_the_default_rates_or_more(hz, rates):
+    found = even_rates(np.arange(20) / hz)
+    assert (found.physics_hz, found.control_hz, found.record_hz) == rates

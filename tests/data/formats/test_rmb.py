@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sart_toolkit.data.formats import get_format
-from sart_toolkit.data.formats.format import Format, Given, about_dataset
+from sart_toolkit.data.formats.format import Arm, Format, Given, about_dataset
 from sart_toolkit.data.formats.rmb import MAIN, Rmb, _depth_planes, _of_planes
 from sart_toolkit.data.formats.transfer import export_dataset
 from sart_toolkit.data.formats.video import read_video
@@ -133,7 +133,7 @@ def test_of_others_what_the_file_lacks_is_given(name, copy_of, trajectories):
         "task": "peg_in_hole",
         "robot": "ur5e_2f85",
         "gripper_range": (0.0, 255.0),
-        "fk": model.fk,
+        "arm": Arm(model.fk, model.ik, np.array(model.spec.home), np.eye(4)),
         "cameras": model.mounted_cameras(),
     }
     read = format.read(recording, Given(**given))
@@ -151,8 +151,9 @@ def test_of_others_what_the_file_lacks_is_given(name, copy_of, trajectories):
         "task": "doesn't say which task it is of; add --task REF",
         "robot": "doesn't say which robot it is of; add --robot REF",
         "gripper_range": "which are open and closed isn't said; add --gripper-range OPEN,CLOSED",
-        "fk": "tool frame is known from the robot alone; add --robot REF",
-        "cameras": "camera 'wrist': where it is mounted isn't said; add --robot REF of a robot",
+        "arm": "tool frame is known from the robot alone; add --robot REF",
+        "cameras": "camera 'wrist': where it is mounted isn't said; add --calibration FILE, or "
+        "--robot REF of a robot",
     }.items():
         rest = {key: value for key, value in given.items() if key != missing}
         with pytest.raises(InvalidInput, match=complaint):
@@ -167,7 +168,7 @@ def test_of_others_what_the_file_lacks_is_given(name, copy_of, trajectories):
 def test_what_the_file_says_itself_is_not_said_again(said, exported):
     recording = Rmb().recordings(exported("rmb"))[0]
     flag = next(iter(said)).replace("_", "-")
-    with pytest.raises(InvalidInput, match=f"says itself what --{flag} would; leave that out"):
+    with pytest.raises(InvalidInput, match=f"says itself what this would; leave --{flag} out"):
         Rmb().read(recording, Given(**said))
 
 
@@ -195,7 +196,8 @@ def test_uneven_times_of_others_are_refused(copy_of):
     foreign(recording)
     with h5py.File(recording, "r+") as file:
         file["time"][5:] += 0.3
-    given = Given("t", "r", gripper_range=(0, 255), fk=lambda q: pose(),
+    arm = Arm(lambda q: pose(), lambda T, q: q, np.zeros(6), pose())
+    given = Given("t", "r", gripper_range=(0, 255), arm=arm,
                   cameras={"wrist": ("tool", np.eye(4))})  # fmt: skip
     with pytest.raises(InvalidInput, match="steps are missing or uneven"):
         Rmb().read(recording, given)
@@ -288,3 +290,29 @@ def test_images_that_are_missing_are_found(copy_of):
         assert len(file["time"]) != len(others["time"])
     (line,) = Rmb().problems(recording)
     assert "wrist_rgb_image.rmb.mp4 has " in line and ", time has " in line
+
+
+def test_cameras_are_taken_by_our_names_with_measured_intrinsics(copy_of):
+    recording = copy_of("rmb_hdf5")
+    foreign(recording)
+    K = np.array([[50.0, 0, 20], [0, 51, 21], [0, 0, 1]])
+    model = RobotModel(get_robot("ur5e_2f85"))
+    given = Given(
+        "peg_in_hole", "ur5e_2f85", gripper_range=(0, 255),
+        arm=Arm(model.fk, model.ik, np.array(model.spec.home), np.eye(4)),
+        cameras={"hand": ("tool", pose([0, 0, 0.1]))},
+        intrinsics={"hand": lambda width, height: K}, camera_names={"hand": "wrist"},
+    )  # fmt: skip
+    format = get_format("rmb_hdf5")
+    camera = format.read(recording, given).steps.cameras["hand"]
+    assert np.array_equal(camera.intrinsics, K) and camera.T_frame_camera[2, 3] == 0.1
+    with h5py.File(main_of(recording), "r+") as file:
+        del file.attrs["wrist_depth_image_fovy"]
+    format.read(recording, given)
+    with pytest.raises(InvalidInput, match="add --calibration FILE, or --camera-intrinsics hand="):
+        format.read(recording, dataclasses.replace(given, intrinsics={}))
+    posed = dataclasses.replace(given.arm, T_frame_tool=pose())
+    with pytest.raises(InvalidInput, match="poses come from its joints; leave --pose-frame out"):
+        format.read(recording, dataclasses.replace(given, arm=posed))
+    with pytest.raises(InvalidInput, match="has columns of fixed names; leave --columns out"):
+        format.read(recording, dataclasses.replace(given, columns={"joints": "a"}))
