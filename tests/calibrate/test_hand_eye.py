@@ -57,14 +57,14 @@ def test_without_noise_in_the_poses_less_is_declared(drawing):
 
 
 @pytest.mark.slow
-def test_what_is_declared_covers_the_truth_in_95_of_100_draws(drawing):
+def test_what_is_declared_covers_the_truth_in_19_of_20_draws(drawing):
     covered = 0
-    for seed in range(100, 140):
-        drawn = drawing(seed=seed, n=10)
+    for seed in range(100, 120):
+        drawn = drawing(seed=seed, n=9)
         found = calibrate_camera(drawn.views, Board(), intrinsics=drawn.K if seed % 2 else None)
         metres, degrees = off(found, drawn)
         covered += metres <= found.hand_eye and degrees <= found.hand_eye_deg
-    assert covered >= 38
+    assert covered >= 19
 
 
 def test_a_view_with_another_s_pose_is_left_out(board_views):
