@@ -82,10 +82,12 @@ def recorded(cells: Cells, path: Path) -> Demonstration:
     return load_demonstration(path)
 
 
-def generated(cells: Cells, demo: Demonstration, directory: Path, n: int) -> Dataset:
+def generated(
+    cells: Cells, demo: Demonstration, directory: Path, n: int, duration: float
+) -> Dataset:
     """Segments by replay, proved clear of the cloud."""
     cloud = CloudConfig(sensor=EmulatedBackend.emulation.sensor)
-    config = AugmentConfig(n=n, obstacles="cloud", cloud=cloud)
+    config = AugmentConfig(n=n, obstacles="cloud", cloud=cloud, duration=duration)
     path = directory / "annotation.json"
     if not path.exists():
         world = world_of(demo, cells.robot, cells.task.scene, config)
@@ -127,6 +129,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("directory", type=Path, help="where the files go")
     parser.add_argument("--task", default="peg_in_hole", help="which task")
     parser.add_argument("--n", type=int, default=30, help="trajectories in all")
+    parser.add_argument("--duration", type=float, default=3.0, help="of a segment, at least [s]")
     parser.add_argument("--image-size", type=int, default=128, help="of images [pixels]")
     parser.add_argument("--epochs", type=int, help="training epochs; the policy's own if left out")
     parser.add_argument("--episodes", type=int, default=50, help="deployments")
@@ -136,7 +139,7 @@ def main(words: Sequence[str] | None = None) -> int:
     directory.mkdir(parents=True, exist_ok=True)
     cells = Cells(get_task(options.task), options.image_size)
     demo = recorded(cells, directory / "demo.h5")
-    dataset = generated(cells, demo, directory, options.n)
+    dataset = generated(cells, demo, directory, options.n, options.duration)
     info = dataset.info
     proofs = [dataset.episode(i).provenance.certificate or {} for i in range(len(dataset))]
     result: dict[str, Any] = {
