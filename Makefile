@@ -5,12 +5,15 @@ PYTHON ?= $(or $(shell command -v python3.11),python3)
 PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
 DEMO_OUT ?= runs/demo
 
+# Material for MkDocs tells of its successor in each run.
+export NO_MKDOCS_2_WARNING := 1
+
 VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-all demo test test-slow lint dist-check clean
+.PHONY: help setup setup-all demo test test-slow lint docs docs-serve dist-check clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -37,11 +40,18 @@ lint: setup ## check style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Not --quiet: warnings that aren't printed aren't errors either.
+docs: $(VENV)/.setup-docs ## build the documentation into site/; a bad link is an error
+	$(BIN)/mkdocs build
+
+docs-serve: $(VENV)/.setup-docs ## show the documentation in a browser, and what changes in it
+	$(BIN)/mkdocs serve
+
 dist-check: setup ## build wheel and sdist, and run each in an empty environment
 	$(BIN)/python tools/check_wheel.py
 
 clean: ## remove .venv, caches and build products, but not runs/
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
@@ -54,6 +64,10 @@ $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
 	        "PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate]'
+	@touch $@
+
+$(VENV)/.setup-docs: $(VENV)/.setup
+	$(PIP_INSTALL) -e '.[docs]'
 	@touch $@
 
 $(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh

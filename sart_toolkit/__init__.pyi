@@ -246,6 +246,8 @@ from .hardware.drivers import ArmState as ArmState
 from .hardware.drivers import CameraImage as CameraImage
 from .learn.policies import POLICIES as POLICIES
 from .learn.policies import get_policy as get_policy
+from .learn.policies.encoder import Encoder as Encoder
+from .learn.policies.mlp import MLPPolicy as MLPPolicy
 from .learn.policy import Policy as Policy
 from .learn.policy import PolicySetup as PolicySetup
 from .learn.skill import Skill as Skill

@@ -889,7 +889,8 @@ def export(
         instruction: the task in a sentence; the first of the task's docstring if left out, or its
             name in words where the task can't be found.
         depth: whether depth images are written.
-        task, robot: in place of those that the recording notes.
+        task: in place of the one that the recording notes.
+        robot: likewise.
         overwrite: whether an earlier export may be replaced.
         progress: called with the trajectories done.
 
@@ -958,7 +959,8 @@ def import_recordings(
         path: a recording, or a directory of several.
         out: the HDF5 file to write; for a directory, the directory of as many.
         format: what it is; found out if left out.
-        task, robot: what it is of, where the file doesn't say so.
+        task: what it is of, where the file doesn't say so.
+        robot: likewise.
         gripper_range: what the file has for an open and for a closed gripper, where it doesn't say.
         calibrations: of cameras, where the file says neither mounting nor intrinsics.
         intrinsics: `(3, 3)` [pixels] by camera, where it doesn't say them.
@@ -1204,7 +1206,9 @@ def evaluate(
     Args:
         skill: the skill.
         out: JSON file to write; videos go beside it. An interrupted evaluation resumes.
-        task, robot, backend: in place of those that the skill notes.
+        task: in place of the one that the skill notes.
+        robot: likewise.
+        backend: likewise.
         workers: how many processes, or `Workers` elsewhere.
         device: where the policy runs.
         overwrite: whether `out` may be replaced.
@@ -1706,7 +1710,9 @@ def run_skill(
         skill: the directory.
         placement: where the object stands; drawn at random with `seed` if left out.
         seed: of the placement.
-        task, robot, backend: in place of those that the skill notes.
+        task: in place of the one that the skill notes.
+        robot: likewise.
+        backend: likewise.
         device: where the policy runs.
         watch: called at the start and after each step with what is observed, the number of steps
             done and whether the goal is reached.

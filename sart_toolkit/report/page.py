@@ -9,6 +9,7 @@ import base64
 import collections
 import functools
 import math
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,10 +42,11 @@ from sart_toolkit.report.figures import (
     training_curve,
 )
 
-MAX_VIDEO_BYTES = 48 * 2**20
+# A page can be sent to somebody: with what else is on it, 3 MB.
+MAX_VIDEO_BYTES = 2**20
 _FILM_IMAGES = 8
-# Of each kind of failure so many final images are shown.
-_LAST_IMAGES = 6
+# Of each kind of failure so many final images are shown, and of so many kinds.
+_LAST_IMAGES, _KINDS_PICTURED = 6, 4
 
 Shown = dict[str, Any]
 
@@ -103,6 +105,7 @@ class _Run:
     annotating: float
     augmentation: Mapping[str, Any] | None
     paths: Sequence[SegmentPath]
+    example: Path | None
     proofs: Sequence[Mapping[str, Any]]
     training: Mapping[str, Any] | None
     evaluation: Mapping[str, Any] | None
@@ -153,6 +156,7 @@ def _load_run(directory: Path) -> _Run:
         annotating=annotating,
         augmentation=dataset.info if dataset is not None else None,
         paths=paths,
+        example=min((directory / "dataset" / "episodes").rglob("*.h5"), default=None),
         proofs=proofs,
         training=optional("skill/training.json", lambda path: read_json(path, TrainingFile)),
         evaluation=optional("evaluation.json", lambda path: read_json(path, EvaluationFile)),
@@ -364,9 +368,11 @@ def _spheres(run: _Run) -> Shown | str:
         return f"No {name} in this run: there are no precision spheres to draw."
     demonstration, annotation, paths = run.demonstration, run.annotation, run.paths
     annotation.check_matches(demonstration)
+    rejected: Sequence[int] = ()
     if run.augmentation is not None:
         rows = _field(run.augmentation, "dataset.json", "by_sphere")
         waypoints = [row["waypoint"] for row in rows if row["source"] == 0]
+        rejected = [sum(row["rejections"].values()) for row in rows if row["source"] == 0]
         if waypoints != [sphere.waypoint for sphere in annotation.spheres]:
             # By a strategy that has spheres of its own.
             paths = ()
@@ -386,6 +392,7 @@ def _spheres(run: _Run) -> Shown | str:
             "limited_by": sphere.limited_by,
             "source": sphere.source,
             "paths": counts[i] if paths else None,
+            "rejected": rejected[i] if paths else None,
         }
         for i, sphere in enumerate(annotation.spheres)
     ]
@@ -474,9 +481,11 @@ def _success(run: _Run) -> Shown | str:
             "reached": reached_words(kind),
             "drawing": last_images(
                 [(run.directory, e) for e in episodes if e["episode"] in kind.episodes]
-            ),
+            )
+            if rank < _KINDS_PICTURED
+            else None,
         }
-        for kind in group_failures(episodes)
+        for rank, kind in enumerate(group_failures(episodes))
     ]
     at_any_time = None
     if "n_success_any" in run.evaluation:
@@ -550,7 +559,7 @@ def _videos(run: _Run) -> Shown | str:
     videos: list[Shown] = []
     left_out: list[str] = []
     room = MAX_VIDEO_BYTES
-    for row in rows:
+    for row in _alternating(rows):
         name = str(_field(row, "evaluation.json", "path"))
         path = (run.directory / name).resolve()
         if not path.is_relative_to(run.directory.resolve()):
@@ -574,6 +583,16 @@ def _videos(run: _Run) -> Shown | str:
             }
         )
     return {"videos": videos, "left_out": left_out}
+
+
+def _alternating(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The first of each outcome, then the second of each, and so on."""
+    seen: collections.Counter[Any] = collections.Counter()
+    ranked = []
+    for row in rows:
+        seen[row.get("outcome")] += 1
+        ranked.append((seen[row.get("outcome")], row))
+    return [row for _, row in sorted(ranked, key=lambda pair: pair[0])]
 
 
 def _rollouts(run: _Run) -> Shown | str:
@@ -636,9 +655,18 @@ def _details(run: _Run) -> Shown | str:
         hashes["demonstration"] = run.demonstration.content_hash()
     if run.augmentation is not None:
         hashes["dataset"] = run.augmentation.get("content_hash")
-    command = {"command": run.run.get("command", "")} if run.run is not None else None
+    commands: Shown = {}
+    if run.run is not None:
+        commands["all of it"] = run.run.get("command", "")
+    if run.demonstration is not None and run.demonstrations == 1:
+        commands["see the demonstration"] = (
+            f"sart play {shlex.quote(str(run.directory / 'demo.h5'))}"
+        )
+    if run.example is not None:
+        commands["see a generated trajectory"] = f"sart play {shlex.quote(str(run.example))}"
+    commands["make this page"] = f"sart report {shlex.quote(str(run.directory))}"
     groups = {
-        "Command": command,
+        "Commands": commands,
         "Run configuration": config(run.run),
         "Augmentation configuration": config(run.augmentation),
         "Training configuration": config(run.training),
@@ -652,12 +680,12 @@ def _details(run: _Run) -> Shown | str:
 # --- the page -----------------------------------------------------------------------------------
 
 _SECTIONS: tuple[tuple[str, str, Callable[[_Run], Shown | str]], ...] = (
+    ("The skill at work", "videos.html", _videos),
     ("The demonstration", "demonstration.html", _demonstration),
     ("Where precision matters", "spheres.html", _spheres),
     ("What the robot generated by itself", "augmentation.html", _augmentation),
     ("Learning", "training.html", _training),
     ("How well it works", "success.html", _success),
-    ("Videos", "videos.html", _videos),
     ("Every rollout", "rollouts.html", _rollouts),
     ("Where the time went", "time.html", _time),
     ("To make it again", "details.html", _details),
@@ -694,7 +722,13 @@ def _page(run: _Run) -> str:
             found = gather(run)
             absent, shown = (found, None) if isinstance(found, str) else (None, found)
             sections.append(
-                {"title": title, "template": template, "shown": shown, "absent": absent}
+                {
+                    "title": title,
+                    "anchor": template.partition(".")[0],
+                    "template": template,
+                    "shown": shown,
+                    "absent": absent,
+                }
             )
         return (
             templates()

@@ -1,4 +1,4 @@
-"""A robot, task, strategy and backend of one's own work from another folder, by verbs and API."""
+"""A robot, task, strategy and backend of one's own work from another folder, by verbs."""
 
 from __future__ import annotations
 
@@ -77,15 +77,3 @@ def test_what_is_one_s_own_goes_through_all_verbs(
     assert (folder / "film.mp4").exists() and (folder / "report.html").exists()
     noted = {**references, **read_json(folder / "dataset" / "dataset.json", dict)["config"]}
     assert file in json.dumps(noted) and file in f"{noted[kind]}"
-
-
-@pytest.mark.parametrize("kind", OWN)
-def test_what_is_one_s_own_goes_through_the_api(folder: Path, kind: str) -> None:
-    file = OWN[kind][0]
-    shutil.copy(EXAMPLES / file, folder)
-    done = subprocess.run(
-        [sys.executable, file, "out", "4", "1", "1"], capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    assert "/1 succeeded; the page: out/report.html" in done.stdout
-    assert (folder / "out" / "report.html").exists()

@@ -87,7 +87,7 @@ def page(_finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Page:
 def test_page_asks_nothing_of_any_network(page: Page) -> None:
     for _, attributes in page.elements:
         for name in ("src", "href", "srcset", "poster", "action", "data"):
-            assert attributes.get(name, "data:").startswith("data:")
+            assert attributes.get(name, "data:").startswith(("data:", "#"))
     assert not page.all("script") and not page.all("link") and not page.all("iframe")
     assert "url(" not in page.source and "@import" not in page.source
     assert re.search(r"https?://", page.source) is None
@@ -120,6 +120,34 @@ def test_page_is_readable_on_any_screen_and_by_screen_readers(page: Page) -> Non
     roles = [a for _, a in page.elements if "role" in a]
     assert roles and all(a["aria-label"] for a in roles)
     assert all(th.get("scope") == "col" for th in page.all("th"))
+
+
+def test_headline_and_film_come_first_and_the_contents_lead_to_each_section(page: Page) -> None:
+    assert page.text.index("18 / 20") < page.text.index("The skill at work")
+    tags = [tag for tag, _ in page.elements]
+    assert tags.index("video") < tags.index("img")
+    sections = [a["id"] for a in page.all("section")]
+    assert [a["href"] for a in page.all("a")] == [f"#{name}" for name in sections]
+    assert len(set(sections)) == len(sections) == 9
+
+
+def test_films_of_success_and_failure_stand_side_by_side(
+    run_dir: Path, edit_json: EditJson
+) -> None:
+    rows = [
+        {"path": f"videos/{outcome}_000.mp4", "episode": episode, "outcome": outcome}
+        for episode, outcome in enumerate(("success", "success", "failure", "failure"))
+    ]
+    edit_json(run_dir / "evaluation.json", {"videos": rows})
+    labels = [video["aria-label"] for video in written(run_dir).all("video")]
+    assert [label.rpartition(" ")[2] for label in labels] == ["success", "failure"] * 2
+
+
+def test_its_commands_can_be_typed(run_dir: Path) -> None:
+    text = written(run_dir).text
+    assert f"sart report {run_dir}" in text
+    played = re.findall(r"sart play (\S+\.h5)", text)
+    assert len(played) == 2 and all(Path(path).exists() for path in played)
 
 
 def test_page_tells_the_figures(page: Page) -> None:
@@ -240,6 +268,22 @@ def test_failures_are_shown_by_kind_with_how_far_they_came_and_what_was_seen(
     # Of the other two no image is there.
     alts = [shown["alt"] for shown in page.all("img")]
     assert "What overview and wrist camera saw at the end of 1 failed rollout" in alts
+
+
+def test_of_many_kinds_of_failure_the_first_have_images(
+    run_dir: Path, edit_json: EditJson, small_png: bytes
+) -> None:
+    (run_dir / "evaluation_failures").mkdir()
+    rows = []
+    for k, reason in enumerate(("lost", "stuck", "late", "beside", "above", "below")):
+        name = f"evaluation_failures/{k:03d}.png"
+        (run_dir / name).write_bytes(small_png)
+        rows.append({"episode": k, "outcome": "failure", "reason": reason, "final_image": name})
+    edit_json(run_dir / "evaluation.json", {"videos": [], "episodes": rows})
+    page = written(run_dir)
+    alts = [shown["alt"] for shown in page.all("img")]
+    assert sum(alt.startswith("What overview and wrist camera saw") for alt in alts) == 4
+    assert "1 × lost" in page.text and "1 × below" in page.text
 
 
 def test_demonstration_without_images_leaves_a_note(
