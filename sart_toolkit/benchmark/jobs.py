@@ -25,9 +25,9 @@ _PACKAGE = Path(__file__).parents[1]
 # In the order in which they import from each other. What a stage computes depends on those up to
 # its own, and on the pipeline.
 _SOURCES = (
-    "errors.py", "poses.py", "userfiles.py", "registry.py", "data", "workers", "robots", "scenes",
-    "collision", "motion", "backends", "tasks", "record", "annotate", "augment", "learn",
-    "evaluate",
+    "errors.py", "poses.py", "userfiles.py", "registry.py", "data", "workers", "robots",
+    "calibrate", "scenes", "collision", "motion", "hardware", "backends", "tasks", "record",
+    "annotate", "augment", "learn", "evaluate",
 )  # fmt: skip
 _LAST = {
     "record": "record",
