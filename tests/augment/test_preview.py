@@ -12,6 +12,7 @@ from sart_toolkit import pipeline
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.preview import preview_sources
 from sart_toolkit.collision.phases import BODY_STILLNESS, OUT_AND_BACK_STILLNESS
+from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.data.storage import (
     load_demonstration,
     read_json_lines,
@@ -21,7 +22,7 @@ from sart_toolkit.data.storage import (
 from sart_toolkit.errors import InvalidInput, OutputExists
 from sart_toolkit.robots import get_robot
 
-CONFIG = AugmentConfig(n=9, cameras=(), allocation="equal")
+CONFIG = AugmentConfig(n=9, cameras=(), allocation="equal", sampling=SamplingConfig("paper"))
 
 
 @pytest.fixture(scope="module")

@@ -321,7 +321,7 @@ def test_poses_out_of_reach_are_counted_and_end_in_an_error(
     edited = tmp_path / "edited.json"
     edited.write_text(json.dumps(value))
     said = error(capsys, "augment", chain / "demo.h5", edited, "--out", tmp_path / "d", "--n", 2)
-    assert "none of 20 attempts" in said and "out of reach: 1" in said and "smaller radii" in said
+    assert "none of 20 attempts" in said and "out of reach: 20" in said and "smaller radii" in said
 
 
 def test_unknown_names_offer_the_nearest_and_leave_nothing(

@@ -104,6 +104,7 @@ def test_what_isn_t_an_answer_is_an_error_that_says_what_came(answering, answer,
 
 
 def test_a_server_that_hangs_up_is_an_error(gripper, world):
+    gripper.position()  # By now the server has it among those that are connected.
     world.inject("gripper_lost", world.time)
     world.advance(0.01)
     with pytest.raises(ConnectionError, match="doesn't answer"):

@@ -288,7 +288,8 @@ def test_an_episode_of_joints_needs_no_inverse_kinematics(foreign, calibration, 
         ("--gripper-range", 1, "add --gripper-range OPEN,CLOSED"),
         ("--calibration", 1, "camera 'wrist': its intrinsics aren't said; add --calibration FILE, "
          "or --camera-intrinsics wrist=FX,FY,CX,CY"),
-        ("--cameras", 1, "camera 'hand': where it is mounted isn't said; add --calibration FILE"),
+        ("--cameras", 1, "has a calibration or intrinsics but isn't in the recording, which has "
+         "hand; add --cameras wrist="),
         ("--rotation", 1, "how its rotations are written isn't said; add --rotation rotvec or rpy"),
         ("--pose-frame", 1, "of which frame of the robot it is isn't said; add --pose-frame FRAME"),
         ("--columns", 4, "which columns are the joints or the tool's pose isn't said; add "
