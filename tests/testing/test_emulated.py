@@ -65,8 +65,9 @@ def test_peg_in_hole_is_recorded_suggested_from_the_cloud_and_augmented_with_one
 
     config = AugmentConfig(n=4, obstacles="cloud", cloud=CloudConfig(sensor=SENSOR), cameras=())
     world = world_of(demo, backend.robot, peg_task.scene, config)
-    annotation = suggest_annotation(demo, world)
-    assert annotation.spheres
+    # One sphere: where a later one can't give its share, the robot has to come by again.
+    found = suggest_annotation(demo, world)
+    annotation = dataclasses.replace(found, spheres=found.spheres[:1])
 
     def augment(ask):
         return augment_demonstration(
