@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from tyro.conf import Positional, arg
 
 from sart_toolkit.augment import STRATEGIES
 from sart_toolkit.data.formats import FORMATS
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.poses import Array
 
 
 def _optional(metavar: str, help: str) -> Any:
@@ -37,21 +35,6 @@ def whole_numbers(flag: str, text: str) -> tuple[int, ...]:
         raise InvalidInput(
             f"--{flag}: expected whole numbers separated by commas, got {text!r}"
         ) from error
-
-
-def intrinsics_of(flag: str, text: str) -> Array:
-    """The matrix `(3, 3)` of "FX,FY,CX,CY".
-
-    Raises:
-        InvalidInput: it is something else.
-    """
-    try:
-        fx, fy, cx, cy = map(float, text.split(","))
-    except ValueError as error:
-        raise InvalidInput(
-            f"{flag}: expected FX,FY,CX,CY in pixels as in 606,606,319.5,239.5, got {text!r}"
-        ) from error
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 _JSON = Annotated[bool, arg(name="json", help="Print the result as one JSON object on stdout.")]

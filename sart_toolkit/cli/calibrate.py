@@ -8,8 +8,9 @@ from sart_toolkit.calibrate.board import Board, save_board
 from sart_toolkit.calibrate.calibration import Calibration, save_calibration
 from sart_toolkit.calibrate.hand_eye import BoardView, calibrate_camera
 from sart_toolkit.calibrate.pictures import views_in_folder, views_of_demonstration
-from sart_toolkit.cli.arguments import Calibrate, intrinsics_of, whole_numbers
+from sart_toolkit.cli.arguments import Calibrate, whole_numbers
 from sart_toolkit.cli.console import say
+from sart_toolkit.cli.sensor import intrinsics_of
 from sart_toolkit.data.records import CameraFrame
 from sart_toolkit.data.storage import check_writable, load_demonstration
 from sart_toolkit.errors import InvalidInput

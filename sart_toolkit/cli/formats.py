@@ -8,8 +8,9 @@ from typing import Any
 
 from sart_toolkit import pipeline
 from sart_toolkit.calibrate.calibration import load_calibration
-from sart_toolkit.cli.arguments import Export, Import, Validate, intrinsics_of
+from sart_toolkit.cli.arguments import Export, Import, Validate
 from sart_toolkit.cli.console import ProgressDisplay, say
+from sart_toolkit.cli.sensor import intrinsics_of
 from sart_toolkit.errors import InvalidInput, Mismatch
 
 

@@ -1,4 +1,4 @@
-"""What the flags about the depth camera say."""
+"""What the flags about cameras say."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from sart_toolkit.collision.sensor import SensorErrors, sensor_errors
 from sart_toolkit.errors import InvalidInput
+from sart_toolkit.poses import Array
 
 
 class SensorFlags(Protocol):
@@ -91,3 +94,18 @@ def _hand_eye(text: str) -> tuple[float, float]:
             f"--hand-eye-error: expected millimetres and degrees as in 2,0.3, got {text!r}"
         ) from error
     return length / 1e3, angle
+
+
+def intrinsics_of(flag: str, text: str) -> Array:
+    """The matrix `(3, 3)` of "FX,FY,CX,CY".
+
+    Raises:
+        InvalidInput: it is something else.
+    """
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError as error:
+        raise InvalidInput(
+            f"{flag}: expected FX,FY,CX,CY in pixels as in 606,606,319.5,239.5, got {text!r}"
+        ) from error
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

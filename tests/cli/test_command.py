@@ -150,6 +150,11 @@ def test_help_and_info_import_nothing_heavy(demo):
         assert code == 0 and modules.isdisjoint(HEAVY), argv
 
 
+@pytest.mark.parametrize("argv", [["--help"], ["--version"], ["recrod"], ["run", "--help"]])
+def test_what_only_says_something_does_not_even_import_numpy(argv):
+    assert "numpy" not in imported(argv)[1]
+
+
 @pytest.mark.parametrize("name", VERBS)
 def test_every_verb_s_function_is_there(name):
     assert VERBS[name].summary.endswith(".")

@@ -336,6 +336,57 @@ def even_rates(time: Array) -> Rates:
     return Rates(physics_hz, control_hz, hz)
 
 
+def imported_demonstration(
+    given: Given,
+    ours: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    steps: Steps,
+    time: Array,
+    success: NDArray[np.bool_],
+) -> Demonstration:
+    """A demonstration of what was read of a file, and of what the file and a person say of it.
+
+    Args:
+        given: what a person says.
+        ours: what only the toolkit's own exports say; nothing of others.
+        provenance: what they say of this recording.
+        steps: the recorded steps.
+        time: their times `(n,)` [s].
+        success: whether the goal was reached at each `(n,)`.
+
+    Raises:
+        InvalidInput: nobody says of which task or robot it is, or the times are uneven.
+    """
+
+    def said(what: str) -> str:
+        found = ours.get(what) or getattr(given, what)
+        if found is None:
+            raise InvalidInput(f"doesn't say which {what} it is of; add --{what} REF")
+        return str(found)
+
+    rates = Rates(**ours["rates"]) if ours else even_rates(time)
+    return Demonstration(
+        task=said("task"),
+        task_parameters=provenance.get("task_parameters", {}),
+        robot=said("robot"),
+        backend=ours.get("backend", "imported"),
+        steps=steps,
+        timestamps=time,
+        body_Ts_world={},
+        success=success,
+        touching=((),) * len(steps),
+        raw_commands=commands_along(steps.commanded_Ts_world_tool, steps.commanded_gripper, rates),
+        states=(),
+        operator=provenance.get("operator", "unknown"),
+        device="imported",
+        seconds=0.0,
+        versions=library_versions(),
+        rates=rates,
+        judged_by="task" if ours else "nobody",
+        references=ours.get("references", given.references),
+    )
+
+
 class Reads(Format):
     """A format that can be imported as well."""
 

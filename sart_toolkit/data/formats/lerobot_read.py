@@ -23,13 +23,12 @@ from sart_toolkit.data.formats.format import (
     ROTATIONS,
     SAID_BY_OURS,
     Given,
-    commands_along,
-    even_rates,
+    imported_demonstration,
     poses_of,
 )
 from sart_toolkit.data.formats.lerobot import INFO, SIDE, VERSION
 from sart_toolkit.data.formats.video import read_video, required
-from sart_toolkit.data.records import CameraRecord, Demonstration, Rates, Steps, library_versions
+from sart_toolkit.data.records import CameraRecord, Demonstration, Steps
 from sart_toolkit.data.storage import parse_json
 from sart_toolkit.errors import BrokenFile, InvalidInput, Unreachable, unknown_name
 from sart_toolkit.poses import Array
@@ -151,40 +150,11 @@ class _Episode:
     def demonstration(self) -> Demonstration:
         """All of it."""
         steps, ours = self._steps(), self._ours
-        n = len(steps)
         time = self._numbers("timestamp")[:, 0]
-        rates = Rates(**ours["rates"]) if ours else even_rates(time)
-        success = np.zeros(n, bool)
+        success = np.zeros(len(steps), bool)
         if ours:
             success[-1] = self._row["sart/success"]
-        return Demonstration(
-            task=self._said("task"),
-            task_parameters=self._provenance.get("task_parameters", {}),
-            robot=self._said("robot"),
-            backend=ours.get("backend", "imported"),
-            steps=steps,
-            timestamps=time,
-            body_Ts_world={},
-            success=success,
-            touching=((),) * n,
-            raw_commands=commands_along(
-                steps.commanded_Ts_world_tool, steps.commanded_gripper, rates
-            ),
-            states=(),
-            operator=self._provenance.get("operator", "unknown"),
-            device="imported",
-            seconds=0.0,
-            versions=library_versions(),
-            rates=rates,
-            judged_by="task" if ours else "nobody",
-            references=ours.get("references", self._given.references),
-        )
-
-    def _said(self, what: str) -> str:
-        found = self._ours.get(what) or getattr(self._given, what)
-        if found is None:
-            raise InvalidInput(f"doesn't say which {what} it is of; add --{what} REF")
-        return str(found)
+        return imported_demonstration(self._given, ours, self._provenance, steps, time, success)
 
     # --- columns --------------------------------------------------------------------------------
 

@@ -27,8 +27,7 @@ from sart_toolkit.data.formats.format import (
     Reads,
     Trajectory,
     all_problems,
-    commands_along,
-    even_rates,
+    imported_demonstration,
     poses_of,
     quaternions,
 )
@@ -44,7 +43,6 @@ from sart_toolkit.data.records import (
     CameraRecord,
     Demonstration,
     Image,
-    Rates,
     Steps,
     library_versions,
 )
@@ -271,40 +269,11 @@ class _Recording:
 
     def demonstration(self) -> Demonstration:
         """All of it."""
-        steps = self._steps()
-        n, ours = len(steps), self._ours
+        steps, ours = self._steps(), self._ours
         time = rows(self._file, "time")[:, 0]
+        reward = rows(self._file, "reward")[:, 0] if ours else np.zeros(len(steps))
         provenance = ours.get("provenance", {})
-        rates = Rates(**ours["rates"]) if ours else even_rates(time)
-        success = rows(self._file, "reward")[:, 0] > 0 if ours else np.zeros(n, bool)
-        return Demonstration(
-            task=self._said("task"),
-            task_parameters=provenance.get("task_parameters", {}),
-            robot=self._said("robot"),
-            backend=ours.get("backend", "imported"),
-            steps=steps,
-            timestamps=time,
-            body_Ts_world={},
-            success=success,
-            touching=((),) * n,
-            raw_commands=commands_along(
-                steps.commanded_Ts_world_tool, steps.commanded_gripper, rates
-            ),
-            states=(),
-            operator=provenance.get("operator", "unknown"),
-            device="imported",
-            seconds=0.0,
-            versions=library_versions(),
-            rates=rates,
-            judged_by="task" if ours else "nobody",
-            references=ours.get("references", self._given.references),
-        )
-
-    def _said(self, what: str) -> str:
-        found = self._ours.get(what) or getattr(self._given, what)
-        if found is None:
-            raise InvalidInput(f"doesn't say which {what} it is of; add --{what} REF")
-        return str(found)
+        return imported_demonstration(self._given, ours, provenance, steps, time, reward > 0)
 
     def _steps(self) -> Steps:
         file = self._file
