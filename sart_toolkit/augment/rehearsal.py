@@ -46,7 +46,8 @@ class Rehearsal:
         """What came of an episode's trajectory.
 
         From the restored state of t* the robot goes out to the sampled pose and comes to a rest.
-        From there it is given the trajectory's actions at the rate of a policy.
+        From there it is given the trajectory's actions at the rate of a policy, and holds still for
+        as long as the goal must be held.
 
         Args:
             planner: of the episode's demonstration.
@@ -110,9 +111,12 @@ class Rehearsal:
         seen = backend.observe()
         off = [distance(seen.T_world_tool, recorded[0])]
         reached: list[bool] = []
-        for action, T_recorded in zip(
-            episode.actions(demonstration)[:-1], recorded[1:], strict=True
-        ):
+        # A trajectory may be shorter than the goal must be held, and the gripper still on its way
+        # at its end. The last action holds still.
+        actions, held = episode.actions(demonstration), self._task.steps_held(rates.record_hz)
+        actions = np.concatenate([actions[:-1], np.repeat(actions[-1:], held, axis=0)])
+        n_moved = len(recorded) - 1
+        for step, action in enumerate(actions):
             desired, gripper = apply_action(controller.commanded_T_world_tool, action)
             for targets in controller.move(desired, seen.T_world_tool, rates.control_per_record):
                 sent = backend.command(targets, gripper)
@@ -120,7 +124,8 @@ class Rehearsal:
                 self._periods += 1
             controller.acknowledge(sent.q)
             seen = backend.observe()
-            off.append(distance(seen.T_world_tool, T_recorded))
+            if step < n_moved:
+                off.append(distance(seen.T_world_tool, recorded[step + 1]))
             reached.append(self._task.success(seen))
         far, turned = np.array(off).T
         row: dict[str, Any] = {

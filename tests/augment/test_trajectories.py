@@ -13,6 +13,7 @@ from sart_toolkit.augment.trajectories import replay_dataset
 from sart_toolkit.backends.interface import KnowsBodies, Resets, SavesStates
 from sart_toolkit.data.combine import merge_datasets
 from sart_toolkit.data.dataset import REPLAY
+from sart_toolkit.data.records import Annotation, PrecisionSphere
 from sart_toolkit.errors import InvalidInput, Mismatch, MissingCapability, OutputExists
 from sart_toolkit.tasks import get_task
 
@@ -42,6 +43,23 @@ def test_generated_trajectories_lead_to_the_goal(dataset, peg_task, make_peg_bac
     assert written["trajectories"] == result["trajectories"]
     names = [row["name"] for row in result["trajectories"]]
     assert sorted(names) == [str(p.relative_to(dataset)) for p in sorted(dataset.rglob("*_k*.h5"))]
+
+
+def test_a_trajectory_that_is_shorter_than_the_goal_must_be_held_counts(
+    peg_demonstration, peg_task, make_peg_backend, tmp_path
+):
+    last = len(peg_demonstration) - 2
+    T = peg_demonstration.steps.measured_Ts_world_tool[last]
+    sphere = PrecisionSphere(last, T, 0.003)
+    annotation = Annotation((sphere,), peg_demonstration.content_hash())
+    path = tmp_path / "end"
+    config = AugmentConfig(n=4, cameras=())
+    made = augment_demonstration(peg_demonstration, annotation, make_peg_backend, path, config)
+    hold = peg_task.steps_held(peg_demonstration.rates.record_hz)
+    assert all(e.provenance.t_star >= last for e in made)
+    assert all(len(e.actions(peg_demonstration)) <= hold for e in made)
+    result = replay_dataset(path, peg_task, make_peg_backend)
+    assert result["n_success"] == result["n_judged"] == len(made)
 
 
 def test_what_was_recorded_on_the_return_is_what_a_policy_will_live_through(
