@@ -6,6 +6,7 @@ The engine generates them as `sart augment` does. Progress goes to stderr.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import resource
 import statistics
@@ -35,46 +36,22 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Rate and memory over time, and what opening, resuming and reading the dataset takes."""
     demonstration, annotation, make = augmentation(options.task, options.image_size)
     cameras = None if options.images else ()
-    config = AugmentConfig(options.episodes + 1, cameras=cameras)
-    every = max(1, options.episodes // _POINTS)
-    course: list[dict[str, float]] = []
-    started = last = time.perf_counter()
-
-    def progress(kept: int, wanted: int, rejected: int) -> None:
-        nonlocal last
-        if kept % every or (course and kept == course[-1]["kept"]):
-            return
-        now = time.perf_counter()
-        done = kept - (course[-1]["kept"] if course else 0)
-        course.append(
-            {
-                "kept": kept,
-                "seconds": now - started,
-                "kept_per_second": done / (now - last),
-                "memory_mb": _memory_mb(),
-            }
+    courses: dict[int, list[dict[str, float]]] = {}
+    # Spheres come one after the other and proofs in small ones take longer, so that only a smaller
+    # dataset with as many parts tells what growing costs.
+    for episodes in (max(1, options.episodes // 10), options.episodes):
+        config, path = AugmentConfig(episodes + 1, cameras=cameras), folder / str(episodes)
+        make_it = functools.partial(
+            augment_demonstration, demonstration, annotation, make, path, config, options.workers
         )
-        last = now
-        print(
-            f"{kept}/{wanted}, {rejected} rejected, {course[-1]['kept_per_second']:.1f}/s, "
-            f"{course[-1]['memory_mb']:.0f} MB",
-            file=sys.stderr,
-            flush=True,
-        )
-
-    dataset = augment_demonstration(
-        demonstration, annotation, make, folder, config, options.workers, progress=progress
-    )
-    generated = time.perf_counter() - started
-    # The first part starts a simulator and builds what the proofs need.
+        courses[episodes] = course = []
+        generated, dataset = _timed(make_it, progress=_Course(course, episodes))
     tenth = max(1, len(course) // 10)
-    rates = [row["kept_per_second"] for row in course[1:]]
-    opening, _ = _timed(load_dataset, folder)
-    resuming, _ = _timed(
-        augment_demonstration, demonstration, annotation, make, folder, config, options.workers
-    )
+    last = [_last_rate(each, tenth) for each in courses.values()]
+    opening, _ = _timed(functools.partial(load_dataset, path))
+    resuming, _ = _timed(make_it)
     reading, _ = _timed(lambda: [episode.provenance.k for episode in dataset])
-    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+    sizes = [file.stat().st_size for file in path.rglob("*") if file.is_file()]
     return {
         "task": options.task,
         "images": options.images,
@@ -84,14 +61,10 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "attempted": dataset.info["n_attempted"],
         "generating_seconds": generated,
         "kept_per_second": len(dataset) / generated,
-        # 1 where the last tenth is as fast as the first.
-        "last_over_first_rate": statistics.median(rates[-tenth:]) / statistics.median(rates[:tenth])
-        if rates
-        else None,
+        # Of the last tenth, over that of a dataset of a tenth as many: 1 where size costs nothing.
+        "last_rate_over_tenth": last[1] / last[0],
         "memory_growth_mb": course[-1]["memory_mb"]
-        - course[min(tenth, len(course) - 1)]["memory_mb"]
-        if course
-        else None,
+        - course[min(tenth, len(course) - 1)]["memory_mb"],
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "size_mb": sum(sizes) / 2**20,
         "kilobytes_per_episode": sum(sizes) / len(dataset) / 1000,
@@ -99,12 +72,45 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "resuming_finished_seconds": resuming,
         "reading_seconds": reading,
         "course": course,
+        "course_of_tenth": courses[min(courses)],
     }
 
 
-def _timed(function: Any, *arguments: Any) -> tuple[float, Any]:
+def _last_rate(course: Sequence[dict[str, float]], tenth: int) -> float:
+    return statistics.median(row["kept_per_second"] for row in course[-tenth:])
+
+
+class _Course:
+    """Notes rate and memory in a list as trajectories are kept."""
+
+    def __init__(self, course: list[dict[str, float]], episodes: int) -> None:
+        self._course, self._every = course, max(1, episodes // _POINTS)
+        self._started = self._last = time.perf_counter()
+
+    def __call__(self, kept: int, wanted: int, rejected: int) -> None:
+        before = int(self._course[-1]["kept"]) if self._course else 0
+        if kept % self._every or kept == before:
+            return
+        now = time.perf_counter()
+        row = {
+            "kept": kept,
+            "seconds": now - self._started,
+            "kept_per_second": (kept - before) / (now - self._last),
+            "memory_mb": _memory_mb(),
+        }
+        self._course.append(row)
+        self._last = now
+        print(
+            f"{kept}/{wanted}, {rejected} rejected, {row['kept_per_second']:.1f}/s, "
+            f"{row['memory_mb']:.0f} MB",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
+def _timed(function: Any, **arguments: Any) -> tuple[float, Any]:
     started = time.perf_counter()
-    result = function(*arguments)
+    result = function(**arguments)
     return time.perf_counter() - started, result
 
 
@@ -127,6 +133,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         check_positive("--episodes", options.episodes)
+        if options.folder is not None:
+            options.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=options.folder) as scratch:
             figures = measure(options, Path(scratch) / "dataset")
         report = {"figures": figures, "machine": doctor.machine(), "versions": library_versions()}

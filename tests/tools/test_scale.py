@@ -30,7 +30,7 @@ def test_it_follows_rate_and_memory_while_the_engine_generates(scale, tmp_path, 
     assert all(row["memory_mb"] > 10 and row["kept_per_second"] > 0 for row in figures["course"])
     assert figures["kilobytes_per_episode"] > 10 and figures["peak_memory_mb"] > 10
     assert 0 < figures["opening_seconds"] < figures["resuming_finished_seconds"]
-    assert figures["last_over_first_rate"] > 0 and "4/4, 0 rejected" in err
+    assert figures["last_rate_over_tenth"] > 0 and "4/4, 0 rejected" in err
 
 
 def test_bad_arguments_are_one_line_and_exit_code_2(scale, capsys):
