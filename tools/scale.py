@@ -36,18 +36,19 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Rate and memory over time, and what opening, resuming and reading the dataset takes."""
     demonstration, annotation, make = augmentation(options.task, options.image_size)
     cameras = None if options.images else ()
-    courses: dict[int, list[dict[str, float]]] = {}
-    # Spheres come one after the other and proofs in small ones take longer, so that only a smaller
-    # dataset with as many parts tells what growing costs.
-    for episodes in (max(1, options.episodes // 10), options.episodes):
-        config, path = AugmentConfig(episodes + 1, cameras=cameras), folder / str(episodes)
+    courses: list[list[dict[str, float]]] = []
+    # Spheres come one after the other and don't take equally long, so that only a smaller dataset
+    # with as many parts tells what growing costs.
+    tenth = max(1, options.episodes // 10)
+    for path, episodes in ((folder / "tenth", tenth), (folder / "whole", options.episodes)):
+        config = AugmentConfig(episodes + 1, cameras=cameras)
         make_it = functools.partial(
             augment_demonstration, demonstration, annotation, make, path, config, options.workers
         )
-        courses[episodes] = course = []
-        generated, dataset = _timed(make_it, progress=_Course(course, episodes))
-    tenth = max(1, len(course) // 10)
-    last = [_last_rate(each, tenth) for each in courses.values()]
+        courses.append([])
+        generated, dataset = _timed(make_it, progress=_Course(courses[-1], episodes))
+    course_of_tenth, course = courses
+    rows = max(1, len(course) // 10)
     opening, _ = _timed(functools.partial(load_dataset, path))
     resuming, _ = _timed(make_it)
     reading, _ = _timed(lambda: [episode.provenance.k for episode in dataset])
@@ -62,9 +63,9 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "generating_seconds": generated,
         "kept_per_second": len(dataset) / generated,
         # Of the last tenth, over that of a dataset of a tenth as many: 1 where size costs nothing.
-        "last_rate_over_tenth": last[1] / last[0],
+        "last_rate_over_tenth": _last_rate(course, rows) / _last_rate(course_of_tenth, rows),
         "memory_growth_mb": course[-1]["memory_mb"]
-        - course[min(tenth, len(course) - 1)]["memory_mb"],
+        - course[min(rows, len(course) - 1)]["memory_mb"],
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "size_mb": sum(sizes) / 2**20,
         "kilobytes_per_episode": sum(sizes) / len(dataset) / 1000,
@@ -72,12 +73,12 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "resuming_finished_seconds": resuming,
         "reading_seconds": reading,
         "course": course,
-        "course_of_tenth": courses[min(courses)],
+        "course_of_tenth": course_of_tenth,
     }
 
 
-def _last_rate(course: Sequence[dict[str, float]], tenth: int) -> float:
-    return statistics.median(row["kept_per_second"] for row in course[-tenth:])
+def _last_rate(course: Sequence[dict[str, float]], rows: int) -> float:
+    return statistics.median(row["kept_per_second"] for row in course[-rows:])
 
 
 class _Course:
@@ -140,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         report = {"figures": figures, "machine": doctor.machine(), "versions": library_versions()}
         if options.out is not None:
             write_json(options.out, report, sealed=False)
-    except SartError as error:
+    except (SartError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(json.dumps(report))

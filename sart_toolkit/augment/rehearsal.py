@@ -46,8 +46,8 @@ class Rehearsal:
         """What came of an episode's trajectory.
 
         From the restored state of t* the robot goes out to the sampled pose and comes to a rest.
-        From there it is given the trajectory's actions at the rate of a policy, and holds still for
-        as long as the goal must be held.
+        From there it is given the trajectory's actions at the rate of a policy, and then
+        holds still until the goal has been held, or for as long as it must be.
 
         Args:
             planner: of the episode's demonstration.
@@ -113,10 +113,12 @@ class Rehearsal:
         reached: list[bool] = []
         # A trajectory may be shorter than the goal must be held, and the gripper still on its way
         # at its end. The last action holds still.
-        actions, held = episode.actions(demonstration), self._task.steps_held(rates.record_hz)
+        actions, rate, n_moved = episode.actions(demonstration), rates.record_hz, len(recorded) - 1
+        held = self._task.steps_held(rate) if p.merged else 0
         actions = np.concatenate([actions[:-1], np.repeat(actions[-1:], held, axis=0)])
-        n_moved = len(recorded) - 1
         for step, action in enumerate(actions):
+            if step >= n_moved and self._task.achieved(np.array(reached), rate):
+                break
             desired, gripper = apply_action(controller.commanded_T_world_tool, action)
             for targets in controller.move(desired, seen.T_world_tool, rates.control_per_record):
                 sent = backend.command(targets, gripper)
@@ -135,7 +137,7 @@ class Rehearsal:
         }
         if not p.merged:
             return row
-        success = self._task.achieved(np.array(reached), rates.record_hz)
+        success = self._task.achieved(np.array(reached), rate)
         row["success"] = success
         if not success:
             row |= {"kind": "goal not reached", "reason": self._task.failure_reason(seen)}

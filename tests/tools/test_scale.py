@@ -33,6 +33,14 @@ def test_it_follows_rate_and_memory_while_the_engine_generates(scale, tmp_path, 
     assert figures["last_rate_over_tenth"] > 0 and "4/4, 0 rejected" in err
 
 
+def test_one_episode_is_followed_into_a_folder_that_is_made(scale, tmp_path, capsys):
+    words = ["--episodes", "1", "--image-size", "32", "--folder", str(tmp_path / "new" / "folder")]
+    assert scale.main(words) == 0
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    assert [row["kept"] for row in figures["course"]] == [1] and figures["last_rate_over_tenth"] > 0
+    assert list((tmp_path / "new" / "folder").iterdir()) == []
+
+
 def test_bad_arguments_are_one_line_and_exit_code_2(scale, capsys):
     assert scale.main(["--episodes", "0"]) == 2
     assert "--episodes: expected a finite number > 0" in capsys.readouterr().err
