@@ -578,39 +578,72 @@ def _bytes_in(path: Path) -> int:
 
 
 def bench_augment(arguments: Sequence[str]) -> dict[str, Any]:
-    """Kept trajectories per second and simulated over wall time, one process, RGB and depth kept.
+    """Kept trajectories per second and simulated over wall time, RGB and depth kept, by processes.
 
-    A whole call of the engine each time: the simulator, every attempt, writing the episodes.
+    A whole call of the engine each time: the simulator, every attempt, writing the episodes; the
+    numbers of processes take turns. `once_started` leaves the first tenth out, in which processes
+    start and compute what each needs once.
     """
     parser = argparse.ArgumentParser(prog="bench.py augment", description=bench_augment.__doc__)
-    parser.add_argument("--task", default="peg_in_hole", help=", ".join(TASKS))
+    parser.add_argument("--tasks", default="peg_in_hole", help=f"all, {', '.join(TASKS)}")
     parser.add_argument("--n", type=int, default=40, help="trajectories, the demonstration counts")
+    parser.add_argument("--workers", type=int, nargs="+", default=[1], help="processes, e.g. 1 2")
     parser.add_argument("--image-size", type=int, default=128, help="[pixels]")
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args(arguments)
     check_positive("--repeats", options.repeats)
-    demonstration, annotation, make = augmentation(options.task, options.image_size)
-    per_second, over_wall = [], []
-    with tempfile.TemporaryDirectory() as scratch:
-        for turn in range(options.repeats):
-            started = time.perf_counter()
-            info = augment_demonstration(
-                demonstration, annotation, make, Path(scratch) / str(turn), AugmentConfig(options.n)
-            ).info
-            seconds = time.perf_counter() - started
-            per_second.append(info["n_kept"] / seconds)
-            over_wall.append(info["simulated_seconds"] / seconds)
-            _say(f"turn {turn + 1}/{options.repeats}: {per_second[-1]:.2f} kept trajectories/s")
+    tasks = list(TASKS) if options.tasks == "all" else options.tasks.split(",")
     return {
-        "kept_trajectories_per_second": statistics.median(per_second),
-        "kept_trajectories_per_second_range": [min(per_second), max(per_second)],
-        "simulated_over_wall": statistics.median(over_wall),
+        "by_task": {task: _augment_figures(task, options) for task in tasks},
+        "n": options.n,
+        "image_size": options.image_size,
+        "repeats": options.repeats,
+    }
+
+
+def _augment_figures(task_name: str, options: argparse.Namespace) -> dict[str, Any]:
+    task = get_task(task_name)
+    demonstration, annotation, make = augmentation(task_name, options.image_size)
+    whole: dict[int, list[float]] = {count: [] for count in options.workers}
+    started: dict[int, list[float]] = {count: [] for count in options.workers}
+    over_wall: list[float] = []
+    times: list[tuple[int, float]] = []
+
+    def progress(done: int, wanted: int, rejected: int) -> None:
+        times.append((done, time.perf_counter()))
+
+    for turn, count in itertools.product(range(options.repeats), options.workers):
+        times.clear()
+        with tempfile.TemporaryDirectory() as scratch:
+            began = time.perf_counter()
+            info = augment_demonstration(
+                demonstration, annotation, make, Path(scratch) / "dataset",
+                AugmentConfig(options.n), count, progress=progress, task=task,
+            ).info  # fmt: skip
+            seconds = time.perf_counter() - began
+        (first, begin), (last, end) = times[len(times) // 10], times[-1]
+        whole[count].append(info["n_kept"] / seconds)
+        started[count].append((last - first) / (end - begin))
+        over_wall.append(info["simulated_seconds"] / seconds / count)
+        _say(
+            f"{task_name}, turn {turn + 1}/{options.repeats}, processes {count}: "
+            f"{whole[count][-1]:.2f} kept trajectories/s, {started[count][-1]:.2f} once started"
+        )
+    return {
+        "kept_trajectories_per_second": _median_and_range(whole),
+        "once_started": _median_and_range(started),
+        "simulated_over_wall_a_process": statistics.median(over_wall),
         "kept": info["n_kept"],
         "attempted": info["n_attempted"],
         "rejections": info["rejections"],
-        "image_size": options.image_size,
-        "processes": 1,
-        "repeats": options.repeats,
+    }
+
+
+def _median_and_range(rates: dict[int, list[float]]) -> dict[str, dict[str, float]]:
+    """The median and the range of the rates of each number of processes."""
+    return {
+        str(count): {"median": statistics.median(row), "min": min(row), "max": max(row)}
+        for count, row in rates.items()
     }
 
 
