@@ -56,6 +56,8 @@ class Strategy(abc.ABC):
             demonstrations.
         annotated: whether it draws from an annotation's spheres.
         plans: whether a segment whose straight line is blocked may bend round obstacles.
+        symmetric: whether poses are as likely mirrored through a sphere's key pose, in position
+            and in rotation; only then they are drawn in fours, see `SamplingConfig.antithetic`.
         policy: the policy that its datasets are for, if no other is asked for.
         n: trajectories in a dataset, if no other number is asked for.
     """
@@ -63,6 +65,7 @@ class Strategy(abc.ABC):
     draws: bool = True
     annotated: bool = True
     plans: bool = False
+    symmetric: bool = False
     policy: str = "compact_mlp"
     n: int = 40
 
@@ -164,12 +167,14 @@ class SphereStrategy(Strategy):
         draw: draws the pose for a sphere.
         rejoin: the waypoint where it rejoins.
         merged: whether the demonstration follows.
+        symmetric: whether `draw` is, as all here are.
     """
 
     draw: Draw = sample_pose
     rejoin: Rejoin = leaving
     merged: bool = True
     plans: bool = False
+    symmetric: bool = True
 
     def propose(
         self,
