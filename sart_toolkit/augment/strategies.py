@@ -156,6 +156,9 @@ def sample_by_kind(
     return draw(sphere, rng, config)
 
 
+_SYMMETRIC = (sample_pose, sample_position, sample_turn, sample_in_region, sample_by_kind)
+
+
 @dataclass(frozen=True)
 class SphereStrategy(Strategy):
     """A pose drawn for a sphere, and a waypoint at which the demonstration is rejoined.
@@ -167,14 +170,17 @@ class SphereStrategy(Strategy):
         draw: draws the pose for a sphere.
         rejoin: the waypoint where it rejoins.
         merged: whether the demonstration follows.
-        symmetric: whether `draw` is, as all here are.
     """
 
     draw: Draw = sample_pose
     rejoin: Rejoin = leaving
     merged: bool = True
     plans: bool = False
-    symmetric: bool = True
+
+    @property
+    def symmetric(self) -> bool:  # type: ignore[override]
+        """Whether `draw` is one of those here; of another, a subclass may say so."""
+        return self.draw in _SYMMETRIC
 
     def propose(
         self,

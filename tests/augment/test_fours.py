@@ -1,6 +1,5 @@
 """Poses drawn in fours: where a tool is drawn says nothing of how it is turned."""
 
-import dataclasses
 import types
 
 import numpy as np
@@ -8,12 +7,21 @@ import pytest
 
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.planner import SegmentPlanner
-from sart_toolkit.augment.strategies import SART, SART_PLANNED
+from sart_toolkit.augment.strategies import SART, SART_PLANNED, SphereStrategy
 from sart_toolkit.data.records import Annotation, PrecisionSphere
-from sart_toolkit.data.sampling import SamplingConfig, antithetic_pose
+from sart_toolkit.data.sampling import SamplingConfig, antithetic_pose, sample_pose
 from sart_toolkit.poses import inverse, log_rotation, pose
 
-UNEVEN = dataclasses.replace(SART, symmetric=False)
+
+def _upwards(sphere, rng, config):
+    """A pose on the upper half of a sphere."""
+    T = sample_pose(sphere, rng, config)
+    up = abs(T[2, 3] - sphere.T_world_key[2, 3])
+    T[2, 3] = sphere.T_world_key[2, 3] + up
+    return T
+
+
+UPPER_HALF = SphereStrategy(draw=_upwards)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +65,7 @@ def test_turns_do_not_go_with_offsets(proposals, n):
 
 @pytest.mark.parametrize(
     ("strategy", "sampling"),
-    [(SART, {"antithetic": False}), (UNEVEN, {})],
+    [(SART, {"antithetic": False}), (UPPER_HALF, {})],
 )
 def test_draws_are_each_on_their_own_if_asked_for_or_if_a_strategy_is_not_symmetric(
     proposals, strategy, sampling
@@ -67,6 +75,16 @@ def test_draws_are_each_on_their_own_if_asked_for_or_if_a_strategy_is_not_symmet
         for i in range(8):
             for other in (*of[:i], *-of[:i]):
                 assert np.linalg.norm(of[i] - other) > 1e-6
+
+
+def test_a_draw_of_one_s_own_is_not_mirrored_to_where_it_draws_nothing(peg_demonstration):
+    config = AugmentConfig(strategy=UPPER_HALF)
+    T_key = peg_demonstration.steps.measured_Ts_world_tool[5]
+    annotation = Annotation((PrecisionSphere(5, T_key, 0.05),), peg_demonstration.content_hash())
+    world = types.SimpleNamespace(demonstration=peg_demonstration)
+    planner = SegmentPlanner(world, annotation, config)
+    heights = [planner.proposal(0, k)[0].T_world_sampled[2, 3] for k in range(16)]
+    assert min(heights) >= T_key[2, 3]
 
 
 def test_a_pose_drawn_is_the_first_of_its_four_and_the_fifth():

@@ -65,7 +65,9 @@ def test_the_augmentation_benchmark_counts_what_it_keeps(capsys):
     out, err = capsys.readouterr()
     figures = json.loads(out.splitlines()[-1])["figures"]["by_task"]["peg_in_hole"]
     assert figures["kept"] == 2 and figures["attempted"] >= 2
-    assert set(figures["kept_trajectories_per_second"]) == set(figures["once_started"]) == {"1", "2"}
+    assert (
+        set(figures["kept_trajectories_per_second"]) == set(figures["once_started"]) == {"1", "2"}
+    )
     # Each attempt simulates two seconds, and before them the short way to a rest.
     rows = figures["kept_trajectories_per_second"].values()
     a_process = [row["median"] / count for count, row in enumerate(rows, 1)]
