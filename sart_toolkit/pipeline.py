@@ -63,6 +63,7 @@ from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.workers import Workers
 
 if TYPE_CHECKING:
+    from sart_toolkit.annotate.suggest import SuggestConfig
     from sart_toolkit.augment.config import AugmentConfig
     from sart_toolkit.augment.preview import Preview
     from sart_toolkit.augment.strategies import Strategy
@@ -471,6 +472,34 @@ def world_of(
     return make_world(source, demonstration, spec, scene, slip_tolerance, cloud)
 
 
+def suggest_config(
+    demonstration: Demonstration,
+    backend: BackendLike | None = None,
+    margin: float | None = None,
+    **options: Any,
+) -> SuggestConfig:
+    """How radii are suggested for a demonstration, its `margin` [m] by the backend if left out.
+
+    The backend is the one that the demonstration notes, if no other is asked for. What was imported
+    may note one that isn't ours; then the margin is `SuggestConfig`'s own.
+
+    Raises:
+        UnknownName: the backend asked for can't be found.
+        InvalidInput: a value is not acceptable.
+    """
+    from sart_toolkit.annotate.suggest import SuggestConfig
+
+    if margin is not None:
+        return SuggestConfig(margin=margin, **options)
+    try:
+        found = _find(demonstration, "backend", backend, get_backend)
+    except UnknownName:
+        if backend is not None:
+            raise
+        return SuggestConfig(**options)
+    return SuggestConfig.for_tracking_error(found.tracking_error, **options)
+
+
 @_alone
 def suggest(
     demo: Path,
@@ -483,6 +512,7 @@ def suggest(
     slip_tolerance: float = 0.005,
     task: TaskLike | None = None,
     robot: RobotLike | None = None,
+    backend: BackendLike | None = None,
     overwrite: bool = False,
     progress: Progress = _silent,
     **options: Any,
@@ -497,10 +527,10 @@ def suggest(
         unknown: with "cloud": what space behind what was seen counts as.
         sensor: with "cloud": what the images may be off by; nothing if left out.
         slip_tolerance: how far what is grasped may move in the grasp [m].
-        task, robot: in place of those that the demonstration notes.
+        task, robot, backend: in place of those that the demonstration notes.
         overwrite: whether `out` may be replaced.
         progress: called with the waypoints done.
-        options: of `SuggestConfig`.
+        options: of `SuggestConfig`; without a `margin`, what `backend`'s tracking error needs.
 
     Raises:
         MissingFile, BrokenFile: the demonstration can't be read.
@@ -508,13 +538,13 @@ def suggest(
         InvalidInput: it can't be learned from (`check_recording`).
         OutputExists, CannotWrite: `out` can't be written.
     """
-    check_names(task=task, robot=robot)
+    check_names(task=task, robot=robot, backend=backend)
     demonstration = load_demonstration(demo)
     check_writable(out, overwrite)
     _check(demonstration, robot_of(demonstration, robot), str(demo))
-    from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
+    from sart_toolkit.annotate.suggest import suggest_annotation
 
-    config = SuggestConfig(**options)
+    config = suggest_config(demonstration, backend, **options)
     world = world_of(demonstration, source, unknown, slip_tolerance, task, robot, sensor)
     n = len(demonstration)
     annotation = suggest_annotation(

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sart_toolkit import doctor, pipeline
-from sart_toolkit.annotate.suggest import suggest_annotation
+from sart_toolkit.annotate.suggest import SuggestConfig, suggest_annotation
 from sart_toolkit.augment.config import AugmentConfig
 from sart_toolkit.augment.engine import augment_demonstration
 from sart_toolkit.augment.planner import world_of
@@ -91,7 +91,8 @@ def generated(
     path = directory / "annotation.json"
     if not path.exists():
         world = world_of(demo, cells.robot, cells.task.scene, config)
-        save_annotation(path, suggest_annotation(demo, world))
+        room = SuggestConfig.for_tracking_error(EmulatedBackend.tracking_error)
+        save_annotation(path, suggest_annotation(demo, world, config=room))
 
     def show(kept: int, wanted: int, rejected: int) -> None:
         print(f"augment: {kept} of {wanted}, {rejected} rejected", file=sys.stderr, flush=True)

@@ -40,6 +40,9 @@ _ARM_MARGIN = 0.005
 _STEEPEST = 5.0
 # A sphere of this radius [m] or more is probed in full, the smallest at a quarter of the poses.
 _WIDE, _FEWEST_PROBES = 0.06, 0.25
+# [m] What augmentation keeps free by default, and bodies' stillness, and 0.1 mm for a path that is
+# not quite the line between its ends.
+_BESIDES_TRACKING = 0.0004
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,14 @@ class SuggestConfig:
             raise InvalidInput(f"shrink: expected a factor above 1, got {self.shrink}")
         if self.probes < 1:
             raise InvalidInput(f"probes: expected at least 1, got {self.probes}")
+
+    @classmethod
+    def for_tracking_error(cls, tracking_error: float, **others: Any) -> SuggestConfig:
+        """With a margin of what augmentation proves on a robot of a tracking error [m].
+
+        Spheres for a simulator would leave no room on a robot that follows less closely.
+        """
+        return cls(margin=round(_BESIDES_TRACKING + tracking_error, 9), **others)
 
 
 @dataclass(frozen=True)

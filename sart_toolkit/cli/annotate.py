@@ -39,7 +39,7 @@ _WITHOUT = "or work without a window: --text, or --suggest-all --no-window"
 
 def annotate_verb(args: Annotate) -> dict[str, Any]:
     """`sart annotate`."""
-    pipeline.check_names(task=args.task, robot=args.robot)
+    pipeline.check_names(task=args.task, robot=args.robot, backend=args.backend)
     sensor = declared_sensor(args, [args.demo])
     headless = args.no_window and not args.text
     if headless and not args.suggest_all:
@@ -56,15 +56,18 @@ def _annotate(
         demonstration = pipeline.noted(load_demonstration(args.demo), args.task, args.robot)
         # Not before the demonstration is read: these imports take a second.
         from sart_toolkit.annotate.session import AnnotateConfig, AnnotationSession
-        from sart_toolkit.annotate.suggest import SuggestConfig
         from sart_toolkit.record.checks import check_recording
 
         robot = pipeline.robot_of(demonstration, args.robot)
         check_recording(demonstration, robot, name=str(args.demo))
         config = AnnotateConfig(
-            SuggestConfig(
-                margin=args.margin, min_radius=args.min_radius, max_radius=args.max_radius
-            )
+            pipeline.suggest_config(
+                demonstration,
+                args.backend,
+                args.margin,
+                min_radius=args.min_radius,
+                max_radius=args.max_radius,
+            )  # fmt: skip
         )
         journal_path = out.with_name(f"{out.name}.journal")
         if headless and journal_path.exists() and not args.overwrite:

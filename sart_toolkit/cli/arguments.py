@@ -165,7 +165,14 @@ _CALIBRATION = Annotated[
         "errors are declared in place of --hand-eye-error; none if left out.",
     ),
 ]
-_TOOL_MARGIN = Annotated[float, arg(help="Distance kept free around the tool [m].")]
+_TOOL_MARGIN = Annotated[
+    float | None,
+    _optional(
+        "METRES",
+        "Distance kept free around the tool [m]; what augmentation proves on the backend, by its "
+        "tracking error, if left out (0.8 mm on the simulators).",
+    ),
+]
 _MIN_RADIUS = Annotated[float, arg(help="Smallest radius of a sphere [m].")]
 _MAX_RADIUS = Annotated[float, arg(help="Largest radius of a sphere [m].")]
 _DISTRIBUTION = Annotated[
@@ -404,13 +411,14 @@ class Suggest:
     ] = ()
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
+    backend: _NOTED_BACKEND = None
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
     depth_scale_error: _DEPTH_SCALE = None
     calibration: _CALIBRATION = ()
-    margin: _TOOL_MARGIN = 0.0008
+    margin: _TOOL_MARGIN = None
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
     max_radius: _MAX_RADIUS = 0.15
@@ -448,13 +456,14 @@ class Annotate:
     ] = "cloud"
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
+    backend: _NOTED_BACKEND = None
     source: _SOURCE = "scene"
     unknown: _UNKNOWN = "behind"
     sensor: _SENSOR = None
     hand_eye_error: _HAND_EYE = None
     depth_scale_error: _DEPTH_SCALE = None
     calibration: _CALIBRATION = ()
-    margin: _TOOL_MARGIN = 0.0008
+    margin: _TOOL_MARGIN = None
     slip_tolerance: _SLIP_TOLERANCE = 0.005
     min_radius: _MIN_RADIUS = 0.004
     max_radius: _MAX_RADIUS = 0.15

@@ -25,6 +25,7 @@ def suggest_verb(args: Suggest) -> dict[str, Any]:
             slip_tolerance=args.slip_tolerance,
             task=args.task,
             robot=args.robot,
+            backend=args.backend,
             overwrite=args.overwrite,
             progress=progress,
             margin=args.margin,

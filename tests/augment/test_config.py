@@ -33,10 +33,16 @@ def test_obstacles_known_from_elsewhere_are_refused():
 @pytest.mark.parametrize("backend", [get_backend(name) for name in BACKENDS])
 def test_suggested_radii_leave_room_for_all_that_augmentation_proves_for(backend):
     """And 0.05 mm for the path, which is within 0.02 mm of the line between poses in the sphere."""
-    assert (
-        SuggestConfig().margin
-        >= AugmentConfig().margin + BODY_STILLNESS + backend.tracking_error + 5e-5
-    )
+    proved = AugmentConfig().margin + BODY_STILLNESS + backend.tracking_error
+    assert SuggestConfig.for_tracking_error(backend.tracking_error).margin >= proved + 5e-5
+    assert SuggestConfig().margin >= proved + 5e-5
+
+
+def test_where_a_robot_follows_less_closely_suggested_radii_leave_as_much_more_room():
+    config = SuggestConfig.for_tracking_error(0.003, max_radius=0.1)
+    proved = AugmentConfig().margin + BODY_STILLNESS + 0.003
+    assert proved + 5e-5 <= config.margin <= proved + 2e-4
+    assert config.max_radius == 0.1
 
 
 @pytest.mark.parametrize("name", ["margin", "slip_tolerance"])
