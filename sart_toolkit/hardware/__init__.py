@@ -13,6 +13,9 @@ ARMS = {
     "lerobot": "sart_toolkit.hardware.lerobot:LeRobotArm",
 }
 GRIPPERS = {"robotiq_socket": "sart_toolkit.hardware.robotiq:RobotiqSocket"}
-CAMERAS = {"realsense": "sart_toolkit.hardware.realsense:RealSense"}
+CAMERAS = {
+    "realsense": "sart_toolkit.hardware.realsense:RealSense",
+    "opencv": "sart_toolkit.hardware.opencv:OpenCVCamera",
+}
 # By the kind of part that a cell's file names.
 DRIVERS = {"arm": ARMS, "gripper": GRIPPERS, "camera": CAMERAS}
