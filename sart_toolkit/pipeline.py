@@ -450,6 +450,27 @@ def demonstration_path(directory: Path, i: int) -> Path:
     return directory / f"demo{i:02d}.h5"
 
 
+def mounting_error(demonstration: Demonstration) -> tuple[float, float]:
+    """How far [m] and [deg] recorded cameras may be from where they are said to be.
+
+    As the file of the cell that the demonstration notes has it, the largest of its cameras; 0 where
+    it notes no cell.
+
+    Raises:
+        MissingFile, BrokenFile, InvalidInput: the cell's file can't be read.
+    """
+    try:
+        cell = getattr(get_backend(demonstration.reference("backend")), "cell", None)
+    except UnknownName:
+        return 0.0, 0.0
+    recorded = demonstration.steps.cameras
+    parts = [part for name, part in cell.cameras.items() if name in recorded] if cell else []
+    return (
+        max((part.hand_eye_mm / 1e3 for part in parts), default=0.0),
+        max((part.hand_eye_deg for part in parts), default=0.0),
+    )
+
+
 def world_of(
     demonstration: Demonstration,
     source: Literal["scene", "cloud"] = "scene",
@@ -461,13 +482,16 @@ def world_of(
 ) -> CollisionWorld:
     """Where the obstacles of a demonstration are, from its scene or from its images alone.
 
-    `sensor`: with "cloud", what its images may be off by; nothing if left out.
+    `sensor`: with "cloud", what its images may be off by; if left out, by what the demonstration's
+    cell has of where its cameras are (`mounting_error`).
     """
     from sart_toolkit.collision import make_world
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
 
     _check_sensor(source, sensor)
     spec, scene = robot_of(demonstration, robot), task_of(demonstration, task).scene
+    if sensor is None and source == "cloud":
+        sensor = SensorErrors(*mounting_error(demonstration))
     cloud = CloudConfig(unknown=unknown, sensor=sensor or SensorErrors())
     return make_world(source, demonstration, spec, scene, slip_tolerance, cloud)
 
@@ -525,7 +549,7 @@ def suggest(
         waypoints: key waypoints; chosen to tile the free part if left out.
         source: what is known of obstacles.
         unknown: with "cloud": what space behind what was seen counts as.
-        sensor: with "cloud": what the images may be off by; nothing if left out.
+        sensor: with "cloud": what the images may be off by, see `world_of`.
         slip_tolerance: how far what is grasped may move in the grasp [m].
         task, robot, backend: in place of those that the demonstration notes.
         overwrite: whether `out` may be replaced.

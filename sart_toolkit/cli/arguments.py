@@ -148,7 +148,7 @@ _HAND_EYE = Annotated[
     _optional(
         "MM,DEG",
         "With --source cloud: how far the camera may be from where it is recorded to be, as in "
-        "2,0.3; nothing if left out.",
+        "2,0.3; what the cell's file says if left out, nothing where there is none.",
     ),
 ]
 _DEPTH_SCALE = Annotated[

@@ -40,6 +40,9 @@ class SensorFlags(Protocol):
 def declared_sensor(flags: SensorFlags, demos: Sequence[Path]) -> SensorErrors | None:
     """The errors that the flags declare of demonstrations' cameras; None if none was given.
 
+    Where neither --hand-eye-error nor --calibration says how far cameras are from where they are
+    said to be, the demonstrations' cells do.
+
     Raises:
         InvalidInput: they are given for obstacles from the scene, can't be read, or contradict
             each other.
@@ -59,7 +62,7 @@ def declared_sensor(flags: SensorFlags, demos: Sequence[Path]) -> SensorErrors |
         raise InvalidInput(
             f"{names[0]}: is about the recorded RGB-D; add --source cloud, or leave it out"
         )
-    hand_eye, scale = _hand_eye(flags.hand_eye_error or "0,0"), flags.depth_scale_error
+    scale = flags.depth_scale_error
     depth_scale = None if scale is None else scale / 100
     if flags.calibration:
         if flags.hand_eye_error is not None:
@@ -68,6 +71,10 @@ def declared_sensor(flags: SensorFlags, demos: Sequence[Path]) -> SensorErrors |
         if calibrated is not None and depth_scale is not None:
             raise InvalidInput("--depth-scale-error: --calibration declares it; leave this out")
         depth_scale = depth_scale if calibrated is None else calibrated
+    elif flags.hand_eye_error is not None:
+        hand_eye = _hand_eye(flags.hand_eye_error)
+    else:
+        hand_eye = _of_their_cells(demos)
     return sensor_errors(flags.sensor or "exact", hand_eye, depth_scale or 0.0)
 
 
@@ -83,6 +90,15 @@ def _calibrated(
     scales = [errors.depth_scale for errors in found if errors.depth_scale is not None]
     hand_eye = max(e.hand_eye for e in found), max(e.hand_eye_deg for e in found)
     return hand_eye, max(scales) if len(scales) == len(found) else None
+
+
+def _of_their_cells(demos: Sequence[Path]) -> tuple[float, float]:
+    """What the cameras of demonstrations are off by, as their cells' files have it."""
+    from sart_toolkit import pipeline
+    from sart_toolkit.data.storage import load_demonstration
+
+    found = [pipeline.mounting_error(load_demonstration(path)) for path in demos]
+    return max(length for length, _ in found), max(angle for _, angle in found)
 
 
 def _hand_eye(text: str) -> tuple[float, float]:
