@@ -63,7 +63,7 @@ $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
 	        "$$($(PYTHON) --version 2>&1). Type: make $(MAKECMDGOALS)" \
 	        "PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate]'
+	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate,modbus]'
 	@touch $@
 
 $(VENV)/.setup-docs: $(VENV)/.setup
@@ -72,5 +72,5 @@ $(VENV)/.setup-docs: $(VENV)/.setup
 
 $(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh
 	bash tools/setup_debian.sh annotate teleop
-	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate,teleop,annotate]'
+	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate,modbus,teleop,annotate]'
 	@touch $@

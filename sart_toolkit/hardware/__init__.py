@@ -12,7 +12,10 @@ ARMS = {
     "ur_rtde": "sart_toolkit.hardware.ur:UrRtdeArm",
     "lerobot": "sart_toolkit.hardware.lerobot:LeRobotArm",
 }
-GRIPPERS = {"robotiq_socket": "sart_toolkit.hardware.robotiq:RobotiqSocket"}
+GRIPPERS = {
+    "robotiq_socket": "sart_toolkit.hardware.robotiq:RobotiqSocket",
+    "robotiq_modbus": "sart_toolkit.hardware.robotiq:RobotiqModbus",
+}
 CAMERAS = {
     "realsense": "sart_toolkit.hardware.realsense:RealSense",
     "opencv": "sart_toolkit.hardware.opencv:OpenCVCamera",
