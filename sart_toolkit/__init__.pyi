@@ -227,7 +227,9 @@ from .errors import (
 )
 from .evaluate.compare import compare_rollouts as compare_rollouts
 from .evaluate.deploy import Deployment as Deployment
+from .evaluate.deploy import Judge as Judge
 from .evaluate.deploy import deploy_skill as deploy_skill
+from .evaluate.deploy import judge_skill as judge_skill
 from .evaluate.rollout import (
     EvaluateConfig as EvaluateConfig,
 )

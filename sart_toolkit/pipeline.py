@@ -13,8 +13,9 @@ import functools
 import inspect
 import logging
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar
 
@@ -68,16 +69,17 @@ if TYPE_CHECKING:
     from sart_toolkit.augment.preview import Preview
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
+    from sart_toolkit.backends.hardware import HardwareBackend
     from sart_toolkit.backends.interface import Backend, BackendFactory
     from sart_toolkit.benchmark.plans import Plan
     from sart_toolkit.calibrate.calibration import Calibration
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
     from sart_toolkit.collision.world import CollisionWorld
     from sart_toolkit.data.formats.format import Arm, Format, Given
-    from sart_toolkit.evaluate.deploy import Deployment
+    from sart_toolkit.evaluate.deploy import Deployment, Judge
     from sart_toolkit.evaluate.rollout import Film, Rollout
     from sart_toolkit.learn.policy import Policy
-    from sart_toolkit.learn.skill import SkillConfig
+    from sart_toolkit.learn.skill import Skill, SkillConfig
     from sart_toolkit.learn.training import TrainConfig
     from sart_toolkit.poses import Array
     from sart_toolkit.record.session import Device, DeviceSetup, SessionConfig
@@ -1332,11 +1334,95 @@ def deploy(
         InvalidInput: the backend is no real robot, or a value is not acceptable.
         RobotStopped: the robot stopped.
     """
+    from sart_toolkit.evaluate.deploy import deploy_skill
+
+    with _on_robot(skill, backend, task, robot, max_seconds, dry_run, device) as use:
+        if ready is not None:
+            speed = use.backend.cell.limits.speed_scale
+            what = "nothing moves" if dry_run else f"the robot moves at {speed:.0%} of its speed"
+            ready(f"The skill acts for up to {use.seconds:g} s of its own time: {what}")
+        return deploy_skill(
+            use.skill, use.backend, use.seconds, dry_run,
+            lambda done: progress("deploy", done, use.seconds),
+        )  # fmt: skip
+
+
+def judge(
+    skill: Path,
+    out: Path,
+    judge: Judge,
+    *,
+    trials: int = 20,
+    backend: BackendLike | None = None,
+    task: TaskLike | None = None,
+    robot: RobotLike | None = None,
+    max_seconds: float | None = None,
+    device: str = "cpu",
+    overwrite: bool = False,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """How well a skill's directory performs on a real robot, a person judging; saved in `out`.
+
+    Args:
+        skill: the skill.
+        out: JSON file to write, as `evaluate` does. An interrupted evaluation resumes.
+        judge: the person.
+        trials: how many count.
+        backend: the cell; the one that the skill notes if left out.
+        task, robot: in place of those that the skill notes.
+        max_seconds: how long a trial lasts at most [s]; the task's horizon if left out.
+        device: where the policy runs.
+        overwrite: whether `out` may be replaced.
+        progress: called with the trials judged.
+
+    Raises:
+        MissingFile, BrokenFile, Mismatch: skill or cell can't be read, or don't fit each other;
+            another evaluation into `out` was interrupted.
+        UnknownName: task, robot or backend can't be found.
+        InvalidInput: the backend is no real robot, or a value is not acceptable.
+        RobotStopped: the robot stopped.
+        OutputExists, CannotWrite: `out` can't be written.
+    """
+    check_writable(out, overwrite)
+    from sart_toolkit.evaluate.deploy import judge_skill
+    from sart_toolkit.learn.skill import skill_hash
+
+    with _on_robot(skill, backend, task, robot, max_seconds, False, device) as use:
+        request = {
+            "verb": "deploy", "skill": skill_hash(skill), "task": use.task.name,
+            "robot": use.backend.robot.name, "backend": use.backend.name, "seconds": use.seconds,
+        }  # fmt: skip
+        return judge_skill(
+            use.skill, use.backend, trials, use.seconds, judge, out, request, overwrite,
+            lambda done, wanted, k: progress("judge", done, wanted, f"{k}/{done} succeeded"),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _OnRobot:
+    """A skill and the robot that it is to act on, for so long [s] at most."""
+
+    skill: Skill
+    backend: HardwareBackend
+    task: Task
+    seconds: float
+
+
+@contextmanager
+def _on_robot(
+    skill: Path,
+    backend: BackendLike | None,
+    task: TaskLike | None,
+    robot: RobotLike | None,
+    max_seconds: float | None,
+    dry_run: bool,
+    device: str,
+) -> Iterator[_OnRobot]:
+    """A skill and the real robot that it acts on, connected."""
     check_names(task=task, robot=robot, backend=backend)
     if not (skill / "config.json").exists():
         raise MissingFile(f"{skill}: no such skill directory; make it with `sart train`")
     from sart_toolkit.backends.hardware import HardwareBackend, without_motion
-    from sart_toolkit.evaluate.deploy import deploy_skill
     from sart_toolkit.learn.skill import load_skill
 
     loaded = load_skill(skill, device)
@@ -1352,13 +1438,7 @@ def deploy(
     make = backend_maker(about, _image_size_of_skill(about), rates, goal, robot, made_of)
     with closing(make()) as made:
         assert isinstance(made, HardwareBackend)
-        if ready is not None:
-            speed = made.cell.limits.speed_scale
-            what = "nothing moves" if dry_run else f"the robot moves at {speed:.0%} of its speed"
-            ready(f"The skill acts for up to {seconds:g} s of its own time: {what}")
-        return deploy_skill(
-            loaded, made, seconds, dry_run, lambda done: progress("deploy", done, seconds)
-        )
+        yield _OnRobot(loaded, made, goal, seconds)
 
 
 def report(run_dir: Path, out: Path | None = None, *, overwrite: bool = False) -> Path:

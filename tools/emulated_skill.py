@@ -114,11 +114,11 @@ def deployed(cells: Cells, skill: Path, episodes: int) -> list[dict[str, Any]]:
         with closing(cells()) as backend:
             held = list[bool]()
 
-            def reached(world: EmulatedWorld = backend.world, held: list[bool] = held) -> bool:
+            def ask_end(world: EmulatedWorld = backend.world, held: list[bool] = held) -> str:
                 held.append(cells.task.success(world.observe()))
-                return cells.task.achieved(np.array(held))
+                return "goal reached" if cells.task.achieved(np.array(held)) else ""
 
-            done = deploy_skill(loaded, backend, cells.task.horizon, reached=reached)
+            done = deploy_skill(loaded, backend, cells.task.horizon, ask_end=ask_end)
         rows.append({"episode": episode, "ended": done.ended, "seconds": done.seconds})
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     return rows

@@ -940,14 +940,19 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Deploy:
-    """Let a skill act on a real robot, from where it stands.
+    """Let a skill act on a real robot, from where it stands; several times, judged by you.
 
     Example: sart deploy skill --backend cell.toml --dry-run
 
     Example: sart deploy skill --backend cell.toml
 
+    Example: sart deploy skill --backend cell.toml --episodes 20 --out trials.json
+
     The first shows what it sees and decides without moving. The robot moves at the speed scale of
-    its cell's file, once you have pressed Enter; Ctrl-C stops it.
+    its cell's file, once you have pressed Enter; Ctrl-C stops it. With --out you say of each trial
+    what it was: space for success, backspace for failure, x if it is not to count; then the robot
+    goes back the way it came. Interrupted, it goes on when the same command is typed again; `sart
+    compare` reads the file.
     """
 
     skill: Annotated[Positional[Path], arg(metavar="SKILL", help="Directory from `sart train`.")]
@@ -960,6 +965,14 @@ class Deploy:
     max_seconds: Annotated[
         float | None, _optional("SECONDS", "How long it acts [s]; the task's horizon if left out.")
     ] = None
+    out: Annotated[
+        Path | None,
+        _optional("PATH", "JSON file of verdicts to write; none is asked for if left out."),
+    ] = None
+    episodes: Annotated[
+        int | None, _optional("INT", "With --out: how many trials count; 20 if left out.")
+    ] = None
+    overwrite: _OVERWRITE = False
     dry_run: Annotated[bool, arg(help="See and decide, and move nothing.")] = False
     unattended: Annotated[
         bool, arg(help="Begin without a person's key, where this isn't typed at a terminal.")

@@ -28,6 +28,7 @@ _UNITS = {
     "sweep": "training",
     "evaluate": "rollout",
     "deploy": "s",
+    "judge": "trial",
     "operator": "episode",
     "replay": "replay",
     "segments": "segment",

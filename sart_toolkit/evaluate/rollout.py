@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import logging
 import time
 from collections import deque
@@ -32,7 +31,6 @@ from sart_toolkit.data.records import (
     Image,
     Rates,
     apply_action,
-    digest,
     library_versions,
 )
 from sart_toolkit.data.result_log import ResultLog
@@ -41,7 +39,7 @@ from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.evaluate.progress import Progress, progress_along
 from sart_toolkit.evaluate.statistics import few_rollouts, wilson_interval
 from sart_toolkit.learn.frames import resize_area
-from sart_toolkit.learn.skill import Skill, load_skill
+from sart_toolkit.learn.skill import Skill, load_skill, skill_hash
 from sart_toolkit.motion.controller import ToolController
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.robots.model import RobotModel
@@ -441,12 +439,9 @@ def _request(
     skill_directory: Path, task: Task, worker: _Worker, config: EvaluateConfig
 ) -> dict[str, Any]:
     """What decides a rollout, besides its number."""
-    files = (Path(skill_directory) / name for name in ("config.json", "model.safetensors"))
     return {
         "verb": "evaluate",
-        "skill": digest(
-            {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-        ),
+        "skill": skill_hash(skill_directory),
         "task": task.name,
         "robot": worker.backend.robot.name,
         "backend": worker.backend.name,

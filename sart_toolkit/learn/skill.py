@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from sart_toolkit.data.records import (
     Demonstration,
     Image,
     Referring,
+    digest,
     library_versions,
 )
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, SartError
@@ -360,6 +362,12 @@ def _write_skill(
     storage.remove(path / CHECKPOINT)
     remove_windows(path)
     return config
+
+
+def skill_hash(directory: Path) -> str:
+    """SHA-256 over what decides how a skill's directory acts: its settings and its weights."""
+    files = (Path(directory) / name for name in ("config.json", "model.safetensors"))
+    return digest({file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files})
 
 
 def load_skill(path: Path, device: str = "cpu") -> Skill:

@@ -9,6 +9,7 @@ import pytest
 
 from sart_toolkit.bringup.cell import examine_cell
 from sart_toolkit.cli import main
+from sart_toolkit.cli.deploy import _Person
 from sart_toolkit.hardware.cell import Limits, Workspace
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.spec import SceneSpec
@@ -80,3 +81,36 @@ def test_parts_that_answer_are_read_and_nothing_moves():
     stopped = examine_cell(world.cell(), world.now)[0]
     assert not stopped.ok and "protective stop" in stopped.detail
     world.close()
+
+
+# --- judged by a person -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("flags", "terminal", "said"),
+    [
+        ("--episodes 3", True, "--episodes: add --out FILE.json"),
+        ("--overwrite", True, "--overwrite: nothing is written without --out"),
+        ("--out t.json --dry-run", True, "--dry-run: leaves nobody anything to judge"),
+        ("--out t.json --unattended", True, "--unattended: leaves nobody anything to judge"),
+        ("--out t.json", False, "--out asks a person for verdicts, by keys"),
+    ],
+)
+def test_what_leaves_nothing_to_judge_is_refused(
+    refused, tmp_path, cell, monkeypatch, flags, terminal, said
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: terminal, raising=False)
+    assert said in refused("deploy", tmp_path, "--backend", cell, *flags.split())
+    assert not (tmp_path / "t.json").exists()
+
+
+def test_a_person_judges_by_keys_and_others_are_passed_over(capsys):
+    typed = iter(["q", "\n", "", "z", " ", "?", "\x7f", "\t", "o"])
+    person = _Person(lambda seconds: next(typed))
+    person.begin(2, 20, 1)
+    assert "Trial 3 of 20, 1 of 2 succeeded so far" in capsys.readouterr().err
+    assert [person.pressed() for _ in range(3)] == [None, None, "success"]
+    assert person.verdict("time is up") == "failure"
+    assert "It ended: time is up" in capsys.readouterr().err
+    assert person.back() == "open"
