@@ -58,8 +58,8 @@ $(VENV)/.setup: pyproject.toml constraints.txt tools/setup_debian.sh
 	@groups="core sapien"; \
 	    $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || groups="python $$groups"; \
 	    bash tools/setup_debian.sh $$groups
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
-	    echo "sart_toolkit needs Python 3.11, but '$(PYTHON) --version' says:" \
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' || { \
+	    echo "sart_toolkit needs Python 3.11 to 3.13, but '$(PYTHON) --version' says:" \
 	        "$$($(PYTHON) --version 2>&1). Type: make $(MAKECMDGOALS)" \
 	        "PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
-from sart_toolkit.backends import make_backend
+from sart_toolkit.backends import DEFAULT_BACKEND, make_backend
 from sart_toolkit.backends.interface import Draws, Observation, Resets, require
 from sart_toolkit.data.records import DEFAULT_RATES, Image, Rates, apply_action
 from sart_toolkit.errors import InvalidInput, MissingExtra, MotionRejected, Unreachable
@@ -75,7 +75,7 @@ class SartEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
     def __init__(
         self,
         task: str | Task | type[Task],
-        backend: str | type[Backend] = "pybullet",
+        backend: str | type[Backend] = DEFAULT_BACKEND,
         robot: str | RobotSpec | None = None,
         cameras: Sequence[str] = ("wrist",),
         image_size: ImageSize = 128,

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from sart_toolkit.augment import STRATEGIES
-from sart_toolkit.backends import BACKENDS, get_backend, is_cell, make_backend
+from sart_toolkit.backends import BACKENDS, DEFAULT_BACKEND, get_backend, is_cell, make_backend
 from sart_toolkit.data.dataset import Dataset, load_dataset
 from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.records import (
@@ -279,7 +279,7 @@ def record(
     out: Path,
     *,
     robot: RobotLike | None = None,
-    backend: BackendLike = "pybullet",
+    backend: BackendLike = DEFAULT_BACKEND,
     device: str | Callable[[DeviceSetup], Device] = "scripted",
     steer: Steer | None = None,
     by_hand: Collection[str] = (),
@@ -1471,7 +1471,7 @@ def run(
     out: Path | str,
     *,
     robot: RobotLike | None = None,
-    backend: BackendLike = "pybullet",
+    backend: BackendLike = DEFAULT_BACKEND,
     strategy: str | Strategy = "sart",
     policy: str | type[Policy] | None = None,
     n: int | None = None,

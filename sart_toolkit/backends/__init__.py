@@ -7,6 +7,7 @@ cell, `path/to/cell.toml`.
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, TypeGuard
 
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
@@ -21,6 +22,8 @@ BACKENDS = {
     "pybullet": "sart_toolkit.backends.pybullet:PyBulletBackend",
     "sapien": "sart_toolkit.backends.sapien:SapienBackend",
 }
+# PyBullet has no wheel for Python 3.12 and later.
+DEFAULT_BACKEND = "pybullet" if find_spec("pybullet") is not None else "sapien"
 
 
 def is_cell(backend: object) -> TypeGuard[str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 
-from sart_toolkit.backends import get_backend
+from sart_toolkit.backends import DEFAULT_BACKEND, get_backend
 from sart_toolkit.backends.interface import Backend, Draws, Resets, SensesContacts
 from sart_toolkit.bringup.fingers import fingers_of
 from sart_toolkit.collision.model import CollisionModel
@@ -233,7 +233,7 @@ def _cameras(robot: RobotSpec, image: Path | None) -> Iterator[Finding]:
         return
     if "wrist" not in {camera.name for camera in robot.cameras}:
         yield _bad("cameras", "none is called 'wrist'", "name that of the wrist so, or tell verbs")
-    backend = _backend("pybullet", robot)
+    backend = _backend(DEFAULT_BACKEND, robot)
     state = SceneState(robot.home, 0.0, {})
     assert isinstance(backend, Draws)
     views = []

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sart_toolkit.augment import STRATEGIES
+from sart_toolkit.backends import DEFAULT_BACKEND
 from sart_toolkit.data.formats import FORMATS
 from sart_toolkit.errors import InvalidInput
 
@@ -47,7 +48,8 @@ _BACKEND = Annotated[
     str,
     arg(
         metavar="REF",
-        help="Simulator or robot to run on: pybullet, sapien, a cell's TOML file, or your own.",
+        help="Simulator or robot to run on: pybullet (Python 3.11 only), sapien, a cell's TOML "
+        "file, or your own.",
     ),
 ]
 _REF = "a name, module:NAME or file.py:NAME"
@@ -200,7 +202,7 @@ class Run:
 
     task: _TASK
     out: Annotated[Path, arg(help="Directory to write.")]
-    backend: _BACKEND = "pybullet"
+    backend: _BACKEND = DEFAULT_BACKEND
     robot: _ROBOT = None
     strategy: _STRATEGY = "sart"
     policy: _POLICY = None
@@ -260,7 +262,7 @@ class Record:
             metavar="REF", help="What steers: keyboard, spacemouse, gamepad, scripted, or your own."
         ),
     ] = "scripted"
-    backend: _BACKEND = "pybullet"
+    backend: _BACKEND = DEFAULT_BACKEND
     robot: _ROBOT = None
     frame: Annotated[
         Literal["world", "tool"] | None,
@@ -1070,7 +1072,7 @@ class BenchmarkRadii:
     """
 
     tasks: _TASKS = "all"
-    backends: _BACKENDS = "pybullet"
+    backends: _BACKENDS = DEFAULT_BACKEND
     draws: Annotated[int, arg(help="Random poses in each sphere.")] = 2000
     directed: Annotated[int, arg(help="Directed draws in each enlarged sphere.")] = 20_000
     seed: _SEED = 0
@@ -1098,7 +1100,7 @@ class BenchmarkCloud:
     """
 
     tasks: _TASKS = "all"
-    backends: _BACKENDS = "pybullet"
+    backends: _BACKENDS = DEFAULT_BACKEND
     seed: _SEED = 0
     noise: Annotated[int, arg(help="Noise draws for each task and sensor; 0: images as drawn.")] = 0
     workers: Annotated[

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from sart_toolkit.backends import DEFAULT_BACKEND
 from sart_toolkit.errors import BrokenFile, InvalidInput, MissingFile, unknown_name
 
 PLANS = (
@@ -48,7 +49,7 @@ class PlanCell:
     """
 
     task: str
-    backend: str = "pybullet"
+    backend: str = DEFAULT_BACKEND
     evaluate_on: str | None = None
     strategy: str = "sart"
     n: int | None = None
