@@ -6,8 +6,9 @@ import functools
 import json
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from sart_toolkit.cli import main
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.errors import MissingExtra
 from sart_toolkit.poses import Array
 from sart_toolkit.record.scripted import ScriptedOperator
 from sart_toolkit.record.session import record_demonstration
@@ -45,6 +47,26 @@ LONGEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first, then the order in which tests were found."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+def _needs_pybullet() -> Generator[None, Any, Any]:
+    """Skips where PyBullet has no wheel, as from Python 3.12 on."""
+    try:
+        return (yield)
+    except MissingExtra as error:
+        if find_spec("pybullet") is None and "pybullet" in str(error):
+            pytest.skip(str(error))
+        raise
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup() -> Generator[None, Any, Any]:
+    return (yield from _needs_pybullet())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Generator[None, Any, Any]:
+    return (yield from _needs_pybullet())
 
 
 @pytest.fixture(scope="session", autouse=True)

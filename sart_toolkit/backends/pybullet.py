@@ -25,7 +25,7 @@ from sart_toolkit.backends.raycast import RayCaster
 from sart_toolkit.backends.states import pack_state, scene_digest, unpack_state
 from sart_toolkit.backends.targets import PeriodTargets
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
-from sart_toolkit.errors import BrokenFile
+from sart_toolkit.errors import BrokenFile, MissingExtra
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.robots.elements import add_joint, rigid_link
 from sart_toolkit.robots.frames import without_frames
@@ -58,8 +58,14 @@ def _without_greetings() -> Iterator[None]:
         os.close(nowhere)
 
 
-with _without_greetings():
-    import pybullet as p
+try:
+    with _without_greetings():
+        import pybullet as p
+except ImportError as error:
+    raise MissingExtra(
+        f"pybullet can't be imported ({error}); it has no wheel for Python 3.12 and later: use "
+        "--backend sapien, or Python 3.11"
+    ) from error
 
 # As a prism, which is what a cylinder becomes otherwise, it would be a millimetre larger.
 _URDF_FLAGS = (
