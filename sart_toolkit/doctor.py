@@ -398,6 +398,27 @@ def machine() -> dict[str, str | int | float]:
     }
 
 
+def source_commit() -> str | None:
+    """The commit of the Git checkout that the toolkit runs from; None where it was installed.
+
+    "+" follows it where tracked files differ from it.
+    """
+    root = Path(__file__).resolve().parents[1]
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(root), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        # It may be installed somewhere inside a checkout of something else.
+        if Path(git("rev-parse", "--show-toplevel")) != root:
+            return None
+        changed = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("+" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
 def usable_cores() -> int:
     """How many cores this process may keep busy: its CPU affinity, less a container's quota."""
     cores = len(os.sched_getaffinity(0))

@@ -46,7 +46,7 @@ from sart_toolkit.data.storage import (
     save_demonstration,
     write_json,
 )
-from sart_toolkit.doctor import machine
+from sart_toolkit.doctor import machine, source_commit
 from sart_toolkit.errors import (
     InvalidInput,
     Mismatch,
@@ -211,7 +211,7 @@ def backend_maker(
 
 
 def _setting(
-    source: Referring, task: TaskLike | None, robot: RobotLike | None
+    source: Referring, task: TaskLike | None = None, robot: RobotLike | None = None
 ) -> tuple[RobotSpec, SceneSpec]:
     """The robot and the scene of a recording or skill, as they looked when it was made."""
     spec, scene = robot_of(source, robot), task_of(source, task).scene
@@ -1458,7 +1458,7 @@ def report(run_dir: Path, out: Path | None = None, *, overwrite: bool = False) -
             check_writable(out, overwrite)
         from sart_toolkit.report.page import write_report
 
-        write_report(run_dir, page)
+        write_report(run_dir, page, _setting)
     return page
 
 
@@ -1575,7 +1575,10 @@ def run(
         "device": device,
     }
     state = _resumed(out, wanted, overwrite)
-    state |= {"command": command, "versions": library_versions(), "machine": machine()}
+    state |= {
+        "command": command, "versions": library_versions(), "commit": source_commit(),
+        "machine": machine(),
+    }  # fmt: skip
     write_json(out / "run.json", state)
     skill, evaluation, dataset = out / "skill", out / "evaluation.json", out / "dataset"
     demos, spheres = [out / "demo.h5"], [out / "annotation.json"]

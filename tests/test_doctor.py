@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 import sys
 import time
 import types
@@ -12,7 +14,14 @@ import pytest
 import torch
 
 from sart_toolkit import doctor
-from sart_toolkit.doctor import Finding, Probe, ProbeFailed, diagnose, run_probe
+from sart_toolkit.doctor import (
+    Finding,
+    Probe,
+    ProbeFailed,
+    diagnose,
+    run_probe,
+    source_commit,
+)
 from sart_toolkit.testing.desktop import Desktop
 
 
@@ -227,3 +236,44 @@ def test_wrong_physics_and_an_empty_image_are_caught() -> None:
         doctor._check_fall(1.0)
     with pytest.raises(ProbeFailed, match="does not show it"):
         doctor._check_image(False)
+
+
+def _checkout(directory: Path) -> Path:
+    """A Git repository with one commit and a package in it, as the toolkit would lie there."""
+    package = directory / "sart_toolkit"
+    package.mkdir(parents=True)
+    (package / "doctor.py").write_text("")
+    for words in (
+        ["init", "-q"],
+        ["add", "."],
+        ["-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "one"],
+    ):
+        subprocess.run(["git", "-C", str(directory), *words], check=True)
+    return package / "doctor.py"
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="no Git")
+def test_the_commit_is_of_the_toolkit_s_own_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = _checkout(tmp_path / "own")
+    monkeypatch.setattr(doctor, "__file__", str(module))
+    commit = source_commit()
+    assert commit is not None and len(commit) == 40
+    module.write_text("changed = True")
+    assert source_commit() == commit + "+"
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="no Git")
+def test_a_toolkit_installed_inside_something_else_has_no_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = _checkout(tmp_path / "other")
+    inside = module.parent / "site-packages" / "sart_toolkit"
+    inside.mkdir(parents=True)
+    monkeypatch.setattr(doctor, "__file__", str(inside / "doctor.py"))
+    assert source_commit() is None
+    monkeypatch.setattr(
+        doctor, "__file__", str(tmp_path / "nowhere" / "sart_toolkit" / "doctor.py")
+    )
+    assert source_commit() is None

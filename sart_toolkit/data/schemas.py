@@ -240,6 +240,8 @@ class RunFile(msgspec.Struct):
     stages: dict[str, Seconds]
     command: str = ""
     versions: dict[str, str] = {}
+    # Of the toolkit's own Git checkout, where it ran from one.
+    commit: str | None = None
     machine: Values = {}
 
 

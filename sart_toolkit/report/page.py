@@ -8,14 +8,18 @@ from __future__ import annotations
 import base64
 import collections
 import functools
+import hashlib
 import math
+import os
 import shlex
+import urllib.parse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jinja2
+import markupsafe
 import numpy as np
 from PIL import Image as PillowImage
 
@@ -41,17 +45,25 @@ from sart_toolkit.report.figures import (
     sphere_colour,
     training_curve,
 )
+from sart_toolkit.report.video import last_frame
+from sart_toolkit.report.view import MAX_SEGMENTS, scene_view
+from sart_toolkit.robots.spec import RobotSpec
+from sart_toolkit.scenes.spec import SceneSpec
 
 # A page can be sent to somebody: with what else is on it, 3 MB.
 MAX_VIDEO_BYTES = 2**20
 _FILM_IMAGES = 8
 # Of each kind of failure so many final images are shown, and of so many kinds.
 _LAST_IMAGES, _KINDS_PICTURED = 6, 4
+_TRAJECTORIES_LISTED = 100
+# What isn't a pair of bodies or a reason in words, as `annotate/suggest.py` has it.
+_LIMITS: Mapping[str | None, str] = {"max_radius": "the largest radius that may be suggested"}
 
 Shown = dict[str, Any]
+Setting = Callable[[Demonstration], tuple[RobotSpec, SceneSpec]]
 
 
-def write_report(run_dir: Path, out: Path) -> None:
+def write_report(run_dir: Path, out: Path, setting: Setting | None = None) -> None:
     """Write the page about a run to `out`: images and videos inside, no request to anywhere.
 
     A part that the run doesn't have yet is left out with a line that says so; a part that is
@@ -61,6 +73,8 @@ def write_report(run_dir: Path, out: Path) -> None:
         run_dir: what `sart run` writes: `demo.h5`, `annotation.json`, `dataset/`, `skill/`,
             `evaluation.json`, `videos/`, `run.json`, any of them absent.
         out: the HTML file, written whole or not at all.
+        setting: finds the robot and the scene of a demonstration for the 3D view. Where it raises
+            a `SartError` the page says why neither is shown.
 
     Raises:
         MissingFile: `run_dir` isn't there or holds no part of a run.
@@ -69,7 +83,7 @@ def write_report(run_dir: Path, out: Path) -> None:
         CannotWrite: the disk refuses.
     """
     try:
-        page = _page(_load_run(Path(run_dir)))
+        page = _page(_load_run(Path(run_dir)), Path(out), setting)
         # Half a pair of UTF-16, which JSON lets pass, can't be written.
         page.encode()
     except SartError:
@@ -93,23 +107,34 @@ def write_report(run_dir: Path, out: Path) -> None:
 class _Run:
     """The parts of a run; `None` for those that aren't there.
 
-    Of several demonstrations, `demonstrations` in number, the first is shown with its annotation
-    and its paths; `demonstrating` and `annotating` [s] are a person's time for all of them.
+    Of several demonstrations, at `demonstrations`, the first is shown with its annotation and its
+    paths; `demonstrating` and `annotating` [s] are a person's time for all of them.
     """
 
     directory: Path
     demonstration: Demonstration | None
     annotation: Annotation | None
-    demonstrations: int
+    demonstrations: Sequence[Path]
     demonstrating: float
     annotating: float
     augmentation: Mapping[str, Any] | None
     paths: Sequence[SegmentPath]
-    example: Path | None
-    proofs: Sequence[Mapping[str, Any]]
+    trajectories: Sequence[_Trajectory]
     training: Mapping[str, Any] | None
     evaluation: Mapping[str, Any] | None
     run: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True)
+class _Trajectory:
+    """A generated trajectory's file, sphere, attempt, number of steps, and what is proved of it."""
+
+    path: Path
+    source: int
+    sphere: int
+    k: int
+    steps: int
+    proof: Mapping[str, Any] | None
 
 
 _Part = TypeVar("_Part")
@@ -126,12 +151,16 @@ def _load_run(directory: Path) -> _Run:
     dataset = load_dataset(directory / "dataset") if made else None
     # Of each episode only its path and what is proved of it are kept.
     paths: list[SegmentPath] = []
-    proofs: list[Mapping[str, Any]] = []
-    for episode in dataset if dataset is not None else ():
-        if episode.provenance.source == 0:
+    trajectories: list[_Trajectory] = []
+    for i in range(len(dataset) if dataset is not None else 0):
+        assert dataset is not None
+        episode = dataset.episode(i)
+        provenance = episode.provenance
+        if provenance.source == 0:
             paths += segment_paths([episode])
-        if episode.provenance.certificate is not None:
-            proofs.append(episode.provenance.certificate)
+        at = dataset.path / dataset.index[i].name
+        of = (provenance.source, provenance.sphere, provenance.k)
+        trajectories.append(_Trajectory(at, *of, len(episode), provenance.certificate))
     demonstration = optional("demo.h5", load_demonstration)
     annotation = optional("annotation.json", load_annotation)
     several = sorted((directory / "demos").glob("demo*.h5"))
@@ -151,13 +180,12 @@ def _load_run(directory: Path) -> _Run:
         directory=directory,
         demonstration=demonstration,
         annotation=annotation,
-        demonstrations=len(several) or 1,
+        demonstrations=several or [directory / "demo.h5"],
         demonstrating=demonstrating,
         annotating=annotating,
         augmentation=dataset.info if dataset is not None else None,
         paths=paths,
-        example=min((directory / "dataset" / "episodes").rglob("*.h5"), default=None),
-        proofs=proofs,
+        trajectories=trajectories,
         training=optional("skill/training.json", lambda path: read_json(path, TrainingFile)),
         evaluation=optional("evaluation.json", lambda path: read_json(path, EvaluationFile)),
         run=optional("run.json", lambda path: read_json(path, RunFile)),
@@ -273,6 +301,22 @@ def _names(run: _Run) -> dict[str, str]:
     return names
 
 
+def _lead(run: _Run) -> str:
+    """The run in a sentence."""
+    said = []
+    if run.demonstration is not None:
+        n = len(run.demonstrations)
+        said.append("shown once" if n == 1 else f"shown {n} times")
+    if run.augmentation is not None:
+        kept, _ = _counts(run.augmentation)
+        said.append(f"varied by the robot itself {_plural(kept, 'time')}")
+    if run.evaluation is not None:
+        rate = _success_rate(run.evaluation)
+        said.append(f"successful in {rate['successes']} of {rate['n']} rollouts")
+    words = ", ".join(said)
+    return f"{words[:1].upper()}{words[1:]}." if words else ""
+
+
 def _tiles(run: _Run) -> list[Shown]:
     tiles: list[Shown] = []
 
@@ -290,9 +334,9 @@ def _tiles(run: _Run) -> list[Shown]:
     if run.demonstration is not None:
         d = run.demonstration
         steps = f"{len(d)} steps over {duration(float(d.timestamps[-1] - d.timestamps[0]))}"
-        if run.demonstrations > 1:
+        if len(run.demonstrations) > 1:
             steps = f"the first with {steps}"
-        tile("Demonstrations", str(run.demonstrations), steps, f"steered by {d.operator}")
+        tile("Demonstrations", str(len(run.demonstrations)), steps, f"steered by {d.operator}")
         by_hand = run.annotation is not None and any(
             sphere.source == "human" for sphere in run.annotation.spheres
         )
@@ -362,23 +406,20 @@ def _demonstration(run: _Run) -> Shown | str:
     return {"camera": camera, "film": image(film_strip(d, camera, n), alt)}
 
 
-def _spheres(run: _Run) -> Shown | str:
+def _spheres(run: _Run, setting: Setting | None) -> Shown | str:
     if run.demonstration is None or run.annotation is None:
         name = "demo.h5" if run.demonstration is None else "annotation.json"
         return f"No {name} in this run: there are no precision spheres to draw."
     demonstration, annotation, paths = run.demonstration, run.annotation, run.paths
     annotation.check_matches(demonstration)
-    rejected: Sequence[int] = ()
+    rejections: Sequence[Mapping[str, int]] = ()
     if run.augmentation is not None:
         rows = _field(run.augmentation, "dataset.json", "by_sphere")
         waypoints = [row["waypoint"] for row in rows if row["source"] == 0]
-        rejected = [sum(row["rejections"].values()) for row in rows if row["source"] == 0]
+        rejections = [row["rejections"] for row in rows if row["source"] == 0]
         if waypoints != [sphere.waypoint for sphere in annotation.spheres]:
             # By a strategy that has spheres of its own.
             paths = ()
-
-    def draw(theme: Theme) -> bytes:
-        return scene_image(demonstration, annotation, paths, theme)
 
     counts = collections.Counter(path.sphere for path in paths)
     times = demonstration.timestamps - demonstration.timestamps[0]
@@ -389,10 +430,10 @@ def _spheres(run: _Run) -> Shown | str:
             "seconds": times[sphere.waypoint],
             "radius": sphere.radius,
             "clearance": sphere.clearance,
-            "limited_by": sphere.limited_by,
+            "limited_by": _LIMITS.get(sphere.limited_by, sphere.limited_by),
             "source": sphere.source,
             "paths": counts[i] if paths else None,
-            "rejected": rejected[i] if paths else None,
+            "rejections": rejections[i] if paths else None,
         }
         for i, sphere in enumerate(annotation.spheres)
     ]
@@ -400,7 +441,24 @@ def _spheres(run: _Run) -> Shown | str:
         f"Two 3D views of the demonstrated tool path with {_plural(len(shown), 'precision sphere')}"
         + (f" and {_plural(len(paths), 'augmented path')} leading back to it" if paths else "")
     )
-    return {"drawing": drawn(draw, alt), "spheres": shown}
+    robot, scene, unseen = None, None, "no robot or scene was given for it"
+    if setting is not None:
+        try:
+            robot, scene = setting(demonstration)
+            view = scene_view(demonstration, annotation, paths, robot, scene)
+        # Such as a task's file that is no longer there: no reason to have no page.
+        except SartError as error:
+            robot, scene, unseen = None, None, str(error)
+    if robot is None:
+        view = scene_view(demonstration, annotation, paths)
+    return {
+        "drawing": image(scene_image(demonstration, annotation, paths), alt),
+        "view": view,
+        "unseen": unseen if robot is None else None,
+        "drawn_paths": min(len(paths), MAX_SEGMENTS),
+        "paths": len(paths),
+        "spheres": shown,
+    }
 
 
 def _augmentation(run: _Run) -> Shown | str:
@@ -416,7 +474,6 @@ def _augmentation(run: _Run) -> Shown | str:
         "kept": kept,
         "attempted": attempted,
         "seconds": None if seconds is None else float(seconds),
-        "proof": _proof(run.proofs, kept),
         "outcomes": [
             {"name": name, "count": count, "share": count / max(attempted, 1), "colour": colour}
             for name, count, colour in counted
@@ -425,20 +482,59 @@ def _augmentation(run: _Run) -> Shown | str:
     }
 
 
-def _proof(proofs: Sequence[Mapping[str, Any]], kept: int) -> Shown | None:
-    """The least of what is proved of each path, commanded and measured, and how far they differ."""
+def _proofs(run: _Run) -> Shown | str:
+    if run.augmentation is None:
+        return "No finished dataset in this run: nothing was executed that could be proved clear."
+    proofs = [t.proof for t in run.trajectories if t.proof is not None]
     if not proofs:
-        return None
+        return "Nothing was proved: no generated trajectory has a certificate."
 
-    def least(*keys: str) -> float:
-        return min(float(_field(proof, "dataset", *keys)) for proof in proofs)
+    def bound(which: str) -> Shown:
+        """The least clearance that is proved, and between what."""
+        least = min(proofs, key=lambda proof: _field(proof, "dataset", which, "clearance"))
+        return {
+            "clearance": float(_field(least, "dataset", which, "clearance")),
+            "pair": " / ".join(filter(None, least[which].get("pair", ()))),
+        }
 
+    declared = [proof["tracking_error"] for proof in proofs if "tracking_error" in proof]
     return {
-        "of": "each" if len(proofs) == kept else f"{len(proofs)} of them",
-        "commanded": least("commanded", "clearance"),
-        "measured": least("measured", "clearance"),
+        "of": len(proofs),
+        "kept": len(run.trajectories),
+        "commanded": bound("commanded"),
+        "measured": bound("measured"),
         "deviation": max(float(_field(proof, "dataset", "deviation")) for proof in proofs),
+        "declared": max(declared, default=None),
     }
+
+
+def _trajectories(run: _Run) -> Shown | str:
+    if not run.trajectories:
+        return "No generated trajectory in this run."
+    return {
+        "of": len(run.trajectories),
+        "trajectories": [
+            {
+                "demonstration": t.source,
+                "sphere": t.sphere,
+                "k": t.k,
+                "steps": t.steps,
+                "proved": {
+                    which: _field(t.proof, "dataset", which, "clearance")
+                    for which in ("commanded", "measured")
+                }
+                if t.proof is not None
+                else None,
+                "command": _typed("play", t.path),
+            }
+            for t in run.trajectories[:_TRAJECTORIES_LISTED]
+        ],
+    }
+
+
+def _typed(verb: str, path: Path, *more: str) -> str:
+    """A command about a file, as it can be typed."""
+    return shlex.join(["sart", verb, str(path), *more])
 
 
 def _training(run: _Run) -> Shown | str:
@@ -502,7 +598,7 @@ def reached_words(kind: FailureKind) -> str:
     """How far along the demonstration failures of a kind came, and when."""
     if kind.waypoint is None:
         return "none came within 2 cm of the demonstrated path"
-    return f"waypoint {kind.waypoint:.0f}, after {kind.seconds:.1f}{_SPACE}s"
+    return f"furthest waypoint {kind.waypoint:.0f}, after {kind.seconds:.1f}{_SPACE}s"
 
 
 def last_images(rollouts: Iterable[tuple[Path, Mapping[str, Any]]]) -> Shown | None:
@@ -527,7 +623,8 @@ def last_images(rollouts: Iterable[tuple[Path, Mapping[str, Any]]]) -> Shown | N
     alt = (
         f"What overview and wrist camera saw at the end of {_plural(len(images), 'failed rollout')}"
     )
-    return image(montage(images, captions), alt)
+    # Four in rows of three would leave a gap.
+    return image(montage(images, captions, 2 if len(images) == 4 else 3), alt)
 
 
 def _placements(run: _Run, episodes: Sequence[Mapping[str, Any]]) -> Shown | None:
@@ -550,14 +647,16 @@ def _placements(run: _Run, episodes: Sequence[Mapping[str, Any]]) -> Shown | Non
     return drawn(draw, alt)
 
 
-def _videos(run: _Run) -> Shown | str:
+def _videos(run: _Run, out: Path) -> Shown | str:
     if run.evaluation is None:
         return "No evaluation.json in this run: there are no rollouts to show."
     rows = run.evaluation.get("videos") or []
     if not rows:
         return "The evaluation made no videos."
+    episodes = {e["episode"]: e for e in _field(run.evaluation, "evaluation.json", "episodes")}
     videos: list[Shown] = []
-    left_out: list[str] = []
+    absent: list[str] = []
+    beside: list[Shown] = []
     room = MAX_VIDEO_BYTES
     for row in _alternating(rows):
         name = str(_field(row, "evaluation.json", "path"))
@@ -567,22 +666,31 @@ def _videos(run: _Run) -> Shown | str:
                 f"evaluation.json: video {name!r} lies outside the run; evaluate again"
             )
         if not path.is_file():
-            left_out.append(f"{name} is not there")
+            absent.append(name)
             continue
         if path.stat().st_size > room:
-            left_out.append(f"{name} is too large to be part of this page")
+            link = os.path.relpath(path, out.resolve().parent)
+            beside.append({"name": name, "href": urllib.parse.quote(link)})
             continue
         content = path.read_bytes()
         room -= len(content)
         videos.append(
             {
                 "src": data_uri("video/mp4", content),
+                "poster": data_uri("image/jpeg", last_frame(path)),
                 "episode": row.get("episode", "?"),
                 "outcome": str(row.get("outcome", "")),
                 "evaluated_outcome": row.get("evaluated_outcome"),
+                "reason": episodes.get(row.get("episode"), {}).get("reason"),
             }
         )
-    return {"videos": videos, "left_out": left_out}
+    rate = _success_rate(run.evaluation)
+    return {
+        "videos": videos,
+        "absent": absent,
+        "beside": beside,
+        "all_succeeded": rate["successes"] == rate["n"],
+    }
 
 
 def _alternating(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -655,18 +763,7 @@ def _details(run: _Run) -> Shown | str:
         hashes["demonstration"] = run.demonstration.content_hash()
     if run.augmentation is not None:
         hashes["dataset"] = run.augmentation.get("content_hash")
-    commands: Shown = {}
-    if run.run is not None:
-        commands["all of it"] = run.run.get("command", "")
-    if run.demonstration is not None and run.demonstrations == 1:
-        commands["see the demonstration"] = (
-            f"sart play {shlex.quote(str(run.directory / 'demo.h5'))}"
-        )
-    if run.example is not None:
-        commands["see a generated trajectory"] = f"sart play {shlex.quote(str(run.example))}"
-    commands["make this page"] = f"sart report {shlex.quote(str(run.directory))}"
     groups = {
-        "Commands": commands,
         "Run configuration": config(run.run),
         "Augmentation configuration": config(run.augmentation),
         "Training configuration": config(run.training),
@@ -674,22 +771,33 @@ def _details(run: _Run) -> Shown | str:
         "Versions": versions,
         "Content hashes (SHA-256)": hashes,
     }
-    return {"groups": {name: list(_flat(value)) for name, value in groups.items() if value}}
+    return {
+        "commands": _commands(run),
+        "version": versions.get("sart_toolkit"),
+        "commit": (run.run or {}).get("commit"),
+        "groups": {name: list(_flat(value)) for name, value in groups.items() if value},
+    }
+
+
+def _commands(run: _Run) -> dict[str, str]:
+    """What each command does, and the command."""
+    commands: dict[str, str] = {}
+    if run.run is not None and run.run.get("command"):
+        commands["all of it"] = str(run.run["command"])
+    if run.demonstration is not None:
+        commands["see the demonstration"] = _typed("play", run.demonstrations[0])
+    if run.trajectories:
+        commands["see a generated trajectory"] = _typed("play", run.trajectories[0].path)
+    if (run.directory / "skill" / "config.json").exists():
+        again = str(run.directory / "again.json")
+        commands["evaluate the skill again"] = _typed(
+            "evaluate", run.directory / "skill", "--out", again
+        )
+    commands["make this page"] = _typed("report", run.directory)
+    return commands
 
 
 # --- the page -----------------------------------------------------------------------------------
-
-_SECTIONS: tuple[tuple[str, str, Callable[[_Run], Shown | str]], ...] = (
-    ("The skill at work", "videos.html", _videos),
-    ("The demonstration", "demonstration.html", _demonstration),
-    ("Where precision matters", "spheres.html", _spheres),
-    ("What the robot generated by itself", "augmentation.html", _augmentation),
-    ("Learning", "training.html", _training),
-    ("How well it works", "success.html", _success),
-    ("Every rollout", "rollouts.html", _rollouts),
-    ("Where the time went", "time.html", _time),
-    ("To make it again", "details.html", _details),
-)
 
 
 @functools.cache
@@ -709,18 +817,57 @@ def templates() -> jinja2.Environment:
         "at_least_mm": at_least_mm,
         "at_most_mm": at_most_mm,
         "plural": _plural,
+        "sha256": _script_hash,
+        "breakable": _breakable,
     }
     return environment
 
 
-def _page(run: _Run) -> str:
+def _breakable(name: str) -> markupsafe.Markup:
+    """Names whose lines may end after an underscore."""
+    return markupsafe.Markup("_<wbr>").join(name.split("_"))
+
+
+def _script_hash(script: str) -> str:
+    """What a page's policy calls a script that may run, so that no other does."""
+    digest = hashlib.sha256(script.encode()).digest()
+    return f"sha256-{base64.b64encode(digest).decode('ascii')}"
+
+
+def _script(name: str) -> str:
+    loader = templates().loader
+    assert loader is not None
+    return loader.get_source(templates(), name)[0]
+
+
+def _sections(
+    run: _Run, out: Path, setting: Setting | None
+) -> Iterable[tuple[str, str, Shown | str]]:
+    """Title, template and what it is given of each section, or why there is nothing to show."""
+    return (
+        ("The skill at work", "videos.html", _videos(run, out)),
+        ("The demonstration", "demonstration.html", _demonstration(run)),
+        ("Where precision matters", "spheres.html", _spheres(run, setting)),
+        ("What the robot generated by itself", "augmentation.html", _augmentation(run)),
+        ("What is proved, what was measured", "proofs.html", _proofs(run)),
+        ("Learning", "training.html", _training(run)),
+        ("How well it works", "success.html", _success(run)),
+        ("Every rollout", "rollouts.html", _rollouts(run)),
+        ("Every generated trajectory", "trajectories.html", _trajectories(run)),
+        ("Where the time went", "time.html", _time(run)),
+        ("To make it again", "details.html", _details(run)),
+    )
+
+
+def _page(run: _Run, out: Path, setting: Setting | None) -> str:
     names = _names(run)
-    task = names.pop("task", run.directory.resolve().name)
+    task = names.get("task", run.directory.resolve().name)
     try:
-        sections = []
-        for title, template, gather in _SECTIONS:
-            found = gather(run)
+        sections, scripts = [], ["page.js"]
+        for title, template, found in _sections(run, out, setting):
             absent, shown = (found, None) if isinstance(found, str) else (None, found)
+            if shown is not None and "view" in shown:
+                scripts.append("view.js")
             sections.append(
                 {
                     "title": title,
@@ -734,10 +881,12 @@ def _page(run: _Run) -> str:
             templates()
             .get_template("page.html")
             .render(
-                task=task,
+                task=task[:1].upper() + task[1:].replace("_", " "),
+                lead=_lead(run),
                 facts={key: value for key, value in names.items() if value},
                 tiles=_tiles(run),
                 sections=sections,
+                scripts=[_script(name) for name in scripts],
             )
         )
     except SartError:

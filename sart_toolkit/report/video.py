@@ -19,7 +19,7 @@ from PIL import ImageDraw, ImageFont
 
 from sart_toolkit.data.records import Image
 from sart_toolkit.data.storage import replacing
-from sart_toolkit.errors import CannotWrite, InvalidInput, MissingExtra
+from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, MissingExtra
 from sart_toolkit.poses import check_positive
 
 if TYPE_CHECKING:
@@ -157,6 +157,26 @@ def _ffmpeg() -> str:
             "no ffmpeg for writing videos; run `pip install --force-reinstall imageio-ffmpeg`, or"
             " set IMAGEIO_FFMPEG_EXE to an ffmpeg that has libx264"
         ) from error
+
+
+def last_frame(path: Path) -> bytes:
+    """JPEG bytes of a video file's last image.
+
+    Raises:
+        BrokenFile: it is no video.
+        MissingExtra: there is no ffmpeg.
+    """
+    with tempfile.TemporaryDirectory() as directory:
+        image = Path(directory, "last.jpg")
+        # Of the last second each image is written in place of the one before.
+        command = [
+            _ffmpeg(), "-v", "error", "-nostdin", "-sseof", "-1", "-i", str(path),
+            "-threads", "1", "-q:v", "4", "-update", "1", "-f", "image2", str(image),
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, check=False)
+        if done.returncode != 0 or not image.is_file():
+            raise BrokenFile(f"{path}: can't be read as a video; evaluate again")
+        return image.read_bytes()
 
 
 def film_rollout(

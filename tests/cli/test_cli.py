@@ -19,7 +19,7 @@ from sart_toolkit.cli import main
 from sart_toolkit.data.dataset import load_dataset
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import load_demonstration, read_json_lines
-from sart_toolkit.doctor import Finding
+from sart_toolkit.doctor import Finding, source_commit
 from sart_toolkit.robots import get_robot
 from sart_toolkit.scenes.appearance import Appearance, AppearanceConfig
 from sart_toolkit.tasks import TASKS, get_task
@@ -77,6 +77,8 @@ def test_whole_run_leaves_every_result_and_resumes(
         assert (out / name).exists(), name
     page = (out / "report.html").read_text()
     assert "peg_in_hole" in page and "<video" in page
+    assert 'data-layer="robot"' in page and "Robot and scene are not shown" not in page
+    assert json.loads((out / "run.json").read_text())["commit"] == source_commit()
     evaluation = json.loads((out / "evaluation.json").read_text())
     needed = {"task", "backend", "n_episodes", "n_success", "success_rate", "ci95", "seeds"}
     assert needed | {"policy", "seconds"} <= set(evaluation)

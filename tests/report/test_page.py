@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import hashlib
+import io
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -9,29 +12,33 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image as PillowImage
 
+from sart_toolkit import get_robot, get_task
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import load_demonstration, save_demonstration
 from sart_toolkit.data.writer import write_dataset
-from sart_toolkit.errors import BrokenFile, CannotWrite, Mismatch, MissingFile
+from sart_toolkit.errors import BrokenFile, CannotWrite, Mismatch, MissingFile, UnknownName
 from sart_toolkit.report import page as report
-from sart_toolkit.report.figures import film_strip
+from sart_toolkit.report.figures import film_strip, scene_image
 from sart_toolkit.report.page import at_least_mm, at_most_mm, duration, percent, write_report
 
 EditJson = Callable[[Path, dict[str, Any]], None]
-VOID = {"img", "source", "meta"}
+VOID = {"img", "source", "meta", "input", "br", "wbr"}
 HOSTILE = "<script>alert(1)</script>\"' onload='x' https://evil.example/"
 
 
 class Page(HTMLParser):
-    """A page's elements with their attributes, its text, and whether every element is closed."""
+    """A page's elements with their attributes, its text, its scripts, and what isn't closed."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.elements: list[tuple[str, dict[str, str]]] = []
         self.words: list[str] = []
+        self.scripts: list[str] = []
         self.open: list[str] = []
         self.source = text
         self.feed(text)
@@ -41,12 +48,16 @@ class Page(HTMLParser):
         self.elements.append((tag, {key: value or "" for key, value in attrs}))
         if tag not in VOID:
             self.open.append(tag)
+        if tag in ("td", "br"):
+            self.words.append(" ")
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if self.open[-1:] != ["style"]:
+        if self.open[-1:] == ["script"]:
+            self.scripts.append(data)
+        elif self.open[-1:] != ["style"]:
             self.words.append(data)
 
     @property
@@ -88,11 +99,20 @@ def test_page_asks_nothing_of_any_network(page: Page) -> None:
     for _, attributes in page.elements:
         for name in ("src", "href", "srcset", "poster", "action", "data"):
             assert attributes.get(name, "data:").startswith(("data:", "#"))
-    assert not page.all("script") and not page.all("link") and not page.all("iframe")
+    assert not page.all("link") and not page.all("iframe")
     assert "url(" not in page.source and "@import" not in page.source
     assert re.search(r"https?://", page.source) is None
     policies = [m["content"] for m in page.all("meta") if "http-equiv" in m]
     assert len(policies) == 1 and policies[0].startswith("default-src 'none'")
+    assert "connect-src" not in policies[0]
+
+
+def test_only_the_page_s_own_scripts_may_run(page: Page) -> None:
+    (policy,) = [m["content"] for m in page.all("meta") if "http-equiv" in m]
+    assert [script.get("type") for script in page.all("script")] == ["application/json", None, None]
+    allowed = re.findall(r"'sha256-([^']+)'", policy.partition("script-src")[2])
+    own = [hashlib.sha256(script.encode()).digest() for script in page.scripts[1:]]
+    assert [base64.b64decode(digest) for digest in allowed] == own
 
 
 def test_page_carries_its_images_and_videos(page: Page, _finished_run: Path) -> None:
@@ -102,6 +122,12 @@ def test_page_carries_its_images_and_videos(page: Page, _finished_run: Path) -> 
         for name in ("success", "failure")
     ]
     assert [base64.b64decode(v.removeprefix("data:video/mp4;base64,")) for v in videos] == expected
+    posters = [
+        np.asarray(PillowImage.open(io.BytesIO(base64.b64decode(v["poster"].partition(",")[2]))))
+        for v in page.all("video")
+    ]
+    # Each shows its outcome's strip, and not the other's.
+    assert len(posters) == 2 and not np.array_equal(*posters)
     images = page.all("img")
     assert len(images) == 4
     for image in images:
@@ -109,7 +135,7 @@ def test_page_carries_its_images_and_videos(page: Page, _finished_run: Path) -> 
         assert len(image["alt"]) > 20
         assert int(image["width"]) > 300 and int(image["height"]) > 100
     darker = [source["media"] for source in page.all("source")]
-    assert darker == ["screen and (prefers-color-scheme: dark)"] * 3
+    assert darker == ["screen and (prefers-color-scheme: dark)"] * 2
 
 
 def test_page_is_readable_on_any_screen_and_by_screen_readers(page: Page) -> None:
@@ -128,7 +154,7 @@ def test_headline_and_film_come_first_and_the_contents_lead_to_each_section(page
     assert tags.index("video") < tags.index("img")
     sections = [a["id"] for a in page.all("section")]
     assert [a["href"] for a in page.all("a")] == [f"#{name}" for name in sections]
-    assert len(set(sections)) == len(sections) == 9
+    assert len(set(sections)) == len(sections) == 11
 
 
 def test_films_of_success_and_failure_stand_side_by_side(
@@ -146,8 +172,17 @@ def test_films_of_success_and_failure_stand_side_by_side(
 def test_its_commands_can_be_typed(run_dir: Path) -> None:
     text = written(run_dir).text
     assert f"sart report {run_dir}" in text
-    played = re.findall(r"sart play (\S+\.h5)", text)
-    assert len(played) == 2 and all(Path(path).exists() for path in played)
+    played = [Path(path) for path in re.findall(r"sart play (\S+\.h5)", text)]
+    episodes = set((run_dir / "dataset" / "episodes").rglob("*.h5"))
+    assert set(played) == {run_dir / "demo.h5", *episodes}
+
+
+def test_the_commit_that_made_a_run_is_named(run_dir: Path, edit_json: EditJson) -> None:
+    assert "commit not recorded" in written(run_dir).text
+    edit_json(run_dir / "run.json", {"commit": 40 * "a"})
+    assert f"commit {40 * 'a'} ." in written(run_dir).text.replace(".", " .")
+    edit_json(run_dir / "run.json", {"commit": 40 * "a" + "+"})
+    assert "with changes that were not committed" in written(run_dir).text
 
 
 def test_page_tells_the_figures(page: Page) -> None:
@@ -162,9 +197,11 @@ def test_page_tells_the_figures(page: Page) -> None:
         "4 min 50 s",
         "12 of 15 attempted trajectories were kept (80 %)",
         "path too close peg / block",
-        "The commanded path of each was proved clear before the robot moved, by at least 1.25 mm.",
-        "The path through the joint positions measured on the way was proved clear as well, by at "
-        "least 0.62 mm; it left the commanded one by at most 0.41 mm.",
+        "Clearance along the commanded path of a segment, before the robot moved proved "
+        "at least 1.25 mm 12 of 12 trajectories",
+        "Clearance along the path through the joint positions measured on the way proved "
+        "at least 0.62 mm 12 of 12 trajectories",
+        "from where its commanded path has it measured at most 0.41 mm 12 of 12 trajectories",
         "80.0 mm",
         "gripper - table",
         "compact_mlp was trained for 12 epochs",
@@ -194,9 +231,36 @@ def test_claims_of_clearance_are_the_episodes_own(run_dir: Path, dataset: Datase
     whole = [(source.demonstration, source.annotation)]
     write_dataset(run_dir / "dataset", whole, episodes, dataset.info)
     text = written(run_dir).text
-    assert "The commanded path of 5 of them was proved clear" in text
-    assert "by at least 4.00 mm" in text and "by at least 3.00 mm" in text
-    assert "by at most 0.20 mm" in text
+    assert text.count("5 of 12 trajectories") == 3
+    assert "at least 4.00 mm" in text and "at least 3.00 mm" in text
+    assert "at most 0.20 mm" in text
+
+
+def test_a_bound_names_the_pair_that_it_is_of_and_what_the_backend_declares(
+    run_dir: Path, dataset: Dataset
+) -> None:
+    def proof(k: int) -> dict[str, Any]:
+        return {
+            "commanded": {"clearance": 0.004 + 0.001 * k, "pair": [f"peg {k}", "block"]},
+            "measured": {"clearance": 0.009 - 0.0001 * k, "pair": [f"finger {k}", "table"]},
+            "deviation": 2e-4,
+            "tracking_error": 4e-4,
+        }
+
+    episodes = [
+        dataclasses.replace(
+            episode, provenance=dataclasses.replace(episode.provenance, certificate=proof(k))
+        )
+        for k, episode in enumerate(dataset)
+    ]
+    shutil.rmtree(run_dir / "dataset")
+    (source,) = dataset.sources
+    whole = [(source.demonstration, source.annotation)]
+    write_dataset(run_dir / "dataset", whole, episodes, dataset.info)
+    text = written(run_dir).text
+    assert "at least 4.00 mm peg 0 / block" in text
+    assert "at least 7.90 mm finger 11 / table" in text
+    assert "at most 0.20 mm the backend declares at most 0.40 mm" in text
 
 
 def test_every_rollout_is_in_the_table(page: Page) -> None:
@@ -308,7 +372,64 @@ def test_large_videos_are_named_instead_of_carried(
     monkeypatch.setattr(report, "MAX_VIDEO_BYTES", size)
     page = written(run_dir)
     assert len(page.all("video")) == 1
-    assert "videos/failure_000.mp4 is too large" in page.text
+    assert "Too large to be part of this page: videos/failure_000.mp4" in page.text
+    links = [a["href"] for a in page.all("a") if not a["href"].startswith("#")]
+    assert links == ["videos/failure_000.mp4"]
+    assert (run_dir / links[0]).is_file()
+
+
+def test_a_film_that_is_none_is_named(run_dir: Path) -> None:
+    (run_dir / "videos" / "failure_000.mp4").write_bytes(b"no film")
+    with pytest.raises(BrokenFile, match="failure_000.mp4: can't be read as a video"):
+        written(run_dir)
+
+
+def test_films_say_why_rollouts_failed_or_that_none_did(run_dir: Path, edit_json: EditJson) -> None:
+    text = written(run_dir).text
+    assert "✗ failure episode 6: time limit: peg beside the hole" in text
+    assert "No rollout failed" not in text
+    edit_json(run_dir / "evaluation.json", {"n_success": 20})
+    assert "No rollout failed" in written(run_dir).text
+
+
+def test_the_page_is_made_without_a_robot_that_can_not_be_found_and_says_so(run_dir: Path) -> None:
+    def lost(demonstration: Demonstration) -> Any:
+        raise UnknownName("robot 'mine': not found; pass --robot")
+
+    out = run_dir / "report.html"
+    write_report(run_dir, out, lost)
+    page = Page(out.read_text())
+    assert "Robot and scene are not shown: robot 'mine': not found; pass --robot." in page.text
+    assert "robot" not in [box["data-layer"] for box in page.all("input") if "data-layer" in box]
+
+
+def test_the_largest_radius_that_may_be_suggested_is_said_in_words(run_dir: Path) -> None:
+    path = run_dir / "annotation.json"
+    path.write_text(path.read_text().replace("gripper - table", "max_radius"))
+    assert "80.0 mm the largest radius that may be suggested" in written(run_dir).text
+
+
+def test_rejections_are_told_by_sphere_and_reason(run_dir: Path) -> None:
+    row = "gripper - table 4 3 1 × joint jump 2 × path too close peg / block 90.0 mm"
+    assert row in written(run_dir).text
+
+
+def test_a_whole_page_with_robot_scene_and_films_is_at_most_3_mb(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, robot = get_task("peg_in_hole"), get_robot("ur5e_2f85")
+    monkeypatch.setattr(report, "scene_image", scene_image)
+    # As much film as a page takes, most of it an MP4 box that players skip.
+    films = [run_dir / "videos" / f"{name}_000.mp4" for name in ("success", "failure")]
+    n = report.MAX_VIDEO_BYTES - sum(film.stat().st_size for film in films)
+    with films[0].open("ab") as film:
+        film.write(n.to_bytes(4, "big") + b"free" + bytes(n - 8))
+    write_report(run_dir, run_dir / "report.html", lambda _: (robot, task.scene))
+    page = Page((run_dir / "report.html").read_text())
+    assert len(page.all("video")) == 2
+    assert len(page.source.encode()) <= 3e6
+    carried = sum(len(video["src"]) for video in page.all("video"))
+    assert len(page.source.encode()) - carried <= 1.5e6
 
 
 def test_human_radii_count_as_human_time(run_dir: Path, edit_json: EditJson) -> None:
@@ -362,8 +483,12 @@ def test_hostile_text_stays_text(run_dir: Path, edit_json: EditJson) -> None:
     }  # fmt: skip
     edit_json(run_dir / "evaluation.json", evaluation)
     edit_json(run_dir / "run.json", {"command": HOSTILE, "machine": {HOSTILE: HOSTILE}})
+    spheres = json.loads((run_dir / "annotation.json").read_text())["spheres"]
+    hostile = [{**sphere, "limited_by": f"a_b {HOSTILE}"} for sphere in spheres]
+    edit_json(run_dir / "annotation.json", {"spheres": hostile})
     page = written(run_dir)
-    assert not page.all("script")
+    assert HOSTILE not in "".join(page.scripts)
+    assert len(page.all("script")) == 3
     assert not any("onload" in attributes for _, attributes in page.elements)
     assert HOSTILE in "".join(page.words)
     for _, attributes in page.elements:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import os
 import stat
 import subprocess
@@ -10,11 +11,20 @@ from typing import Any
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from PIL import Image as PillowImage
 
 from sart_toolkit.data.records import Image
-from sart_toolkit.errors import CannotWrite, InvalidInput, MissingExtra
+from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, MissingExtra
 from sart_toolkit.evaluate.rollout import Moment
-from sart_toolkit.report.video import caption, check_frame, film_rollout, font, inset, write_video
+from sart_toolkit.report.video import (
+    caption,
+    check_frame,
+    film_rollout,
+    font,
+    inset,
+    last_frame,
+    write_video,
+)
 
 
 def images(n: int, height: int = 64, width: int = 96) -> Iterator[Image]:
@@ -68,6 +78,21 @@ def test_video_decodes_to_what_was_written(tmp_path: Path) -> None:
     for t, image in enumerate(images(12)):
         assert np.abs(decoded[t].astype(int) - image).mean() < 4
     assert os.listdir(path.parent) == ["a.mp4"]
+
+
+@pytest.mark.parametrize("n", [1, 12, 20])
+def test_the_last_image_of_a_film_is_found_however_long_it_is(tmp_path: Path, n: int) -> None:
+    write_video(tmp_path / "a.mp4", images(n), fps=10)
+    with PillowImage.open(io.BytesIO(last_frame(tmp_path / "a.mp4"))) as found:
+        *_, expected = images(n)
+        assert found.format == "JPEG"
+        assert np.abs(np.asarray(found).astype(int) - expected).mean() < 6
+
+
+def test_a_file_that_is_no_film_has_no_last_image(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"no film")
+    with pytest.raises(BrokenFile, match="a.mp4: can't be read as a video; evaluate again"):
+        last_frame(tmp_path / "a.mp4")
 
 
 @pytest.mark.parametrize("n", [1, 5])
