@@ -10,7 +10,13 @@ setup(
     packages=[*find_packages(include=["sart_toolkit*"]), "sart_toolkit.assets"],
     package_dir={"sart_toolkit.assets": "assets"},
     package_data={
-        "sart_toolkit": ["*.pyi", "py.typed", "report/templates/*", "benchmark/plans/*.toml"],
+        "sart_toolkit": [
+            "*.pyi",
+            "py.typed",
+            "benchmark/plans/*.toml",
+            "bringup/templates/*",
+            "report/templates/*",
+        ],
         "sart_toolkit.assets": ["**/*"],
     },
 )

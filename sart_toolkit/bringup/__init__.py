@@ -1,1 +1,1 @@
-"""A robot of one's own: a first `RobotSpec` from its URDF, and an examination before it moves."""
+"""Something of one's own: a first `RobotSpec` from a URDF, its examination, files to begin with."""

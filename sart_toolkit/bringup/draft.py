@@ -7,13 +7,12 @@ import dataclasses
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from sart_toolkit.bringup.fingers import fingers_of
 from sart_toolkit.collision.model import CollisionModel
-from sart_toolkit.errors import CannotWrite, InvalidInput, OutputExists, SartError
+from sart_toolkit.errors import InvalidInput, SartError
 from sart_toolkit.poses import Array, log_rotation, pose
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.references import resource_path
@@ -394,18 +393,3 @@ def _text(robot: RobotSpec, source: str, doubts: Sequence[str]) -> str:
 
 def _numbers(values: Array) -> str:
     return "[" + ", ".join(f"{round(float(v), 6) + 0.0:.6g}" for v in values) + "]"
-
-
-def write_draft(draft: Draft, out: Path, overwrite: bool = False) -> None:
-    """Write the file of a draft.
-
-    Raises:
-        OutputExists: it is there, and not to be overwritten.
-        CannotWrite: it can't be written.
-    """
-    if out.exists() and not overwrite:
-        raise OutputExists(f"{out} exists; pass --overwrite to replace it, or another --out")
-    try:
-        out.write_text(draft.text)
-    except OSError as error:
-        raise CannotWrite(f"{out}: {error.strerror or error}; choose another --out") from error

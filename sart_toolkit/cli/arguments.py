@@ -1309,3 +1309,58 @@ class NewRobot:
     ] = None
     overwrite: _OVERWRITE = False
     json: _JSON = False
+
+
+_NEW_NAME = Annotated[
+    Positional[str],
+    arg(metavar="NAME", help="What to call it, such as push_block; a class is called PushBlock."),
+]
+_NEW_OUT = Annotated[Path | None, _optional("FILE", "Python file to write; NAME.py if left out.")]
+
+
+@dataclass(frozen=True)
+class NewTask:
+    """Write a commented Task file that works as it stands, to be changed.
+
+    Example: sart new task push_block
+
+    It is a block to be picked up. `sart run push_block.py:PushBlock --out runs/push_block` learns
+    it, `pytest --pyargs sart_toolkit.testing --sart-task push_block.py:PushBlock` tests it.
+    """
+
+    name: _NEW_NAME
+    out: _NEW_OUT = None
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class NewStrategy:
+    """Write a commented Strategy file that works as it stands, to be changed.
+
+    Example: sart new strategy upright
+
+    It varies positions and keeps the tool's orientation. Use it with
+    `sart augment demo.h5 annotation.json --out dataset --strategy upright.py:UPRIGHT`.
+    """
+
+    name: _NEW_NAME
+    out: _NEW_OUT = None
+    overwrite: _OVERWRITE = False
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class NewBackend:
+    """Write a commented Backend file that works as it stands, to be changed.
+
+    Example: sart new backend my_arm
+
+    It is an arm without physics. `sart run peg_in_hole --backend my_arm.py:MyArm --out runs/my_arm`
+    runs on it, `pytest --pyargs sart_toolkit.testing --sart-backend my_arm.py:MyArm` tests it.
+    """
+
+    name: _NEW_NAME
+    out: _NEW_OUT = None
+    overwrite: _OVERWRITE = False
+    json: _JSON = False

@@ -76,6 +76,9 @@ VERBS: Mapping[str, Verb] = {
     "info": Verb(arguments.Info, "sart_toolkit.cli.info:info_verb"),
     "doctor": Verb(arguments.Doctor, "sart_toolkit.cli.doctor:doctor_verb"),
     "new robot": Verb(arguments.NewRobot, "sart_toolkit.cli.new:robot_verb"),
+    "new task": Verb(arguments.NewTask, "sart_toolkit.cli.new:task_verb"),
+    "new strategy": Verb(arguments.NewStrategy, "sart_toolkit.cli.new:strategy_verb"),
+    "new backend": Verb(arguments.NewBackend, "sart_toolkit.cli.new:backend_verb"),
 }
 
 # What an interruption leaves of these is resumed by the same command.

@@ -40,6 +40,9 @@ class Shape:
             )
         for value in self.size:
             check_positive(f"{self.kind} size", value, "m")
+        if not isinstance(self.size, tuple):
+            # An array, say: what is drawn and what tells scenes apart goes by its value.
+            object.__setattr__(self, "size", tuple(map(float, self.size)))
         T = check_pose("T_body_shape", self.T_body_shape)
         object.__setattr__(self, "T_body_shape", frozen(T))
 

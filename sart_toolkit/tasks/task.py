@@ -117,7 +117,10 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def plan(self, state: SceneState) -> list[PlanStep]:
-        """The steps by which a person would steer the tool from the start to the goal."""
+        """The steps by which a person would steer the tool from the start to the goal.
+
+        None, `[]`, if only a person can do it.
+        """
 
     def achieved(
         self, success: NDArray[np.bool_], record_hz: int = DEFAULT_RATES.record_hz

@@ -9,8 +9,8 @@ if TYPE_CHECKING:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add `--sart-backend` and `--sart-robot`."""
-    group = parser.getgroup("sart", "backends of sart_toolkit")
+    """Add `--sart-backend`, `--sart-robot` and `--sart-task`."""
+    group = parser.getgroup("sart", "backends and tasks of sart_toolkit")
     group.addoption(
         "--sart-backend",
         action="append",
@@ -25,17 +25,27 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="robot to test it with: one of ROBOTS, module:SPEC or file.py:SPEC; may be "
         "repeated (default: one with a linkage, ur5e_2f85, and one with jaws, ur5e_hande)",
     )
+    group.addoption(
+        "--sart-task",
+        action="append",
+        metavar="NAME",
+        help="task to test with `--pyargs sart_toolkit.testing`, in place of a backend: one of "
+        "TASKS, module:Class or file.py:Class; may be repeated; on the backends named by "
+        "--sart-backend (default: PyBullet, or SAPIEN without it), with the robots named by "
+        "--sart-robot (default: its own)",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Refuse names of backends and robots that name nothing.
+    """Refuse names of backends, robots and tasks that name nothing.
 
     Raises:
         UsageError: one does.
     """
     backends = config.getoption("--sart-backend") or []
     robots = config.getoption("--sart-robot") or []
-    if not backends and not robots:
+    tasks = config.getoption("--sart-task") or []
+    if not backends and not robots and not tasks:
         return
     # Not imported by every run of pytest where the toolkit is installed.
     import pytest
@@ -43,8 +53,11 @@ def pytest_configure(config: pytest.Config) -> None:
     from sart_toolkit.backends import get_backend
     from sart_toolkit.errors import MissingExtra, UnknownName
     from sart_toolkit.robots import get_robot
+    from sart_toolkit.tasks import get_task
 
     try:
+        for name in tasks:
+            get_task(name)
         for name in robots:
             get_robot(name)
         for name in backends:

@@ -51,7 +51,7 @@ def test_the_doctor_exits_with_1_and_says_each_fault_with_its_remedy(
         ("doctor --robot arm.urdf", "sart new robot arm.urdf --out arm.py"),
         ("doctor --image a.png", "--image: is of a robot; add --robot REF"),
         ("doctor --full --robot panda", "--full: is about this machine"),
-        ("new", "new: of what? add robot"),
+        ("new", "new: of what? add robot, task, strategy, backend"),
         ("new robit", "did you mean 'robot'"),
         ("new robot none.urdf --out a.py", "no such file"),
     ],

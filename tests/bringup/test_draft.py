@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sart_toolkit.bringup.draft import draft_robot, write_draft
+from sart_toolkit.bringup.draft import draft_robot
 from sart_toolkit.bringup.examine import examine
+from sart_toolkit.bringup.skeleton import write_source
 from sart_toolkit.errors import InvalidInput, MissingFile, OutputExists
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
@@ -23,7 +24,7 @@ def drafted(toy: Make, tmp_path: Path) -> RobotSpec:
     """The robot that the file of a draft of the toy makes."""
     toy()
     draft = draft_robot(str(tmp_path / "toy.urdf"))
-    write_draft(draft, tmp_path / "drafted.py")
+    write_source(draft.text, tmp_path / "drafted.py")
     return get_robot(f"{tmp_path / 'drafted.py'}:TOY")
 
 
@@ -66,9 +67,9 @@ def test_a_draft_says_what_to_complete_and_does_not_replace_a_file(
     draft = draft_robot(str(tmp_path / "toy.urdf"), "my arm")
     assert "MY_ARM = sart.RobotSpec(" in draft.text
     assert draft.text.count("# complete:") >= 3
-    write_draft(draft, tmp_path / "a.py")
+    write_source(draft.text, tmp_path / "a.py")
     with pytest.raises(OutputExists, match="pass --overwrite"):
-        write_draft(draft, tmp_path / "a.py")
+        write_source(draft.text, tmp_path / "a.py")
 
 
 def test_an_arm_without_fingers_gets_a_fixed_tool(toy: Make, tmp_path: Path) -> None:

@@ -53,6 +53,10 @@ def test_a_shape_of_unknown_kind_is_refused():
         Shape("cone", (1, 1))
 
 
+def test_a_size_may_be_an_array():
+    assert Shape("box", np.array([0.1, 0.2, 0.3])).size == (0.1, 0.2, 0.3)
+
+
 @pytest.mark.parametrize(
     ("kind", "size"), [("box", (1, 1)), ("cylinder", (1,)), ("sphere", (1, 1))]
 )

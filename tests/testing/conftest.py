@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from sart_toolkit.backends import DEFAULT_BACKEND
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -56,34 +58,54 @@ def run_pytest() -> Callable[..., subprocess.CompletedProcess[str]]:
     return _run_pytest
 
 
+Outcomes = dict[str, Outcome]
+
+
+def _outcomes(folder: Path, names: list[str], rest: str, words: list[str]) -> Outcomes:
+    """Run the suite; the outcome of each name, which begins a test's parameters before `rest`."""
+    # Warnings are errors, but for SAPIEN's that Debian's libvulkan1 is absent.
+    warnings = ["-W", "error", "-W", "ignore:Failed to find system libvulkan:UserWarning"]
+    result = _run_pytest(folder, *words, "-q", "--junitxml=out.xml", *warnings)
+    assert result.returncode in (0, 1), result.stdout + result.stderr
+    outcomes: dict[str, Outcome] = defaultdict(Outcome)
+    for case in ET.parse(folder / "out.xml").iter("testcase"):
+        test, _, parameters = case.get("name", "").partition("[")
+        (name,) = (n for n in names if parameters.startswith(f"{n}-{rest}"))
+        outcome = outcomes[name]
+        bad = case.find("failure") if case.find("error") is None else case.find("error")
+        skipped = case.find("skipped")
+        if bad is not None:
+            outcome.failed[test] = f"{bad.get('message')}\n{bad.text}"
+        elif skipped is not None:
+            outcome.skipped[test] = str(skipped.get("message"))
+        else:
+            outcome.passed += 1
+    return outcomes
+
+
 @pytest.fixture(scope="session")
 def run_suite(
     tmp_path_factory: pytest.TempPathFactory,
-) -> Callable[[list[str], str], dict[str, Outcome]]:
+) -> Callable[[list[str], str], Outcomes]:
     """Runs the suite on backends with a robot; the outcome by backend."""
 
-    def run(backends: list[str], robot: str) -> dict[str, Outcome]:
-        folder = tmp_path_factory.mktemp("suite")
-        chosen = [word for name in backends for word in ("--sart-backend", name)]
-        # Warnings are errors, but for SAPIEN's that Debian's libvulkan1 is absent.
-        warnings = ["-W", "error", "-W", "ignore:Failed to find system libvulkan:UserWarning"]
-        result = _run_pytest(
-            folder, *chosen, "--sart-robot", robot, "-q", "--junitxml=out.xml", *warnings
-        )
-        assert result.returncode in (0, 1), result.stdout + result.stderr
-        outcomes: dict[str, Outcome] = defaultdict(Outcome)
-        for case in ET.parse(folder / "out.xml").iter("testcase"):
-            test, _, parameters = case.get("name", "").partition("[")
-            (backend,) = (n for n in backends if parameters.startswith(f"{n}-{robot}"))
-            outcome = outcomes[backend]
-            bad = case.find("failure") if case.find("error") is None else case.find("error")
-            skipped = case.find("skipped")
-            if bad is not None:
-                outcome.failed[test] = f"{bad.get('message')}\n{bad.text}"
-            elif skipped is not None:
-                outcome.skipped[test] = str(skipped.get("message"))
-            else:
-                outcome.passed += 1
-        return outcomes
+    def run(backends: list[str], robot: str) -> Outcomes:
+        words = [word for name in backends for word in ("--sart-backend", name)]
+        words += ["--sart-robot", robot]
+        return _outcomes(tmp_path_factory.mktemp("suite"), backends, robot, words)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def run_task_suite(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[..., Outcomes]:
+    """Runs the suite on tasks on a backend; the outcome by task."""
+
+    def run(tasks: list[str], backend: str = DEFAULT_BACKEND) -> Outcomes:
+        words = [word for name in tasks for word in ("--sart-task", name)]
+        words += ["--sart-backend", backend]
+        return _outcomes(tmp_path_factory.mktemp("suite"), tasks, backend, words)
 
     return run

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from sart_toolkit.backends import DEFAULT_BACKEND
 from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import USUAL_ROBOTS, get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.tasks import TASKS
 from sart_toolkit.testing import bench as bench_module
 from sart_toolkit.testing import options, scenes
 from sart_toolkit.testing.bench import make_bench
@@ -19,10 +21,16 @@ from sart_toolkit.testing.bench import make_bench
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_wrong_name_on_the_command_line_is_a_usage_error(run_pytest, tmp_path):
-    result = run_pytest(tmp_path, "--sart-backend", "pybulet")
+@pytest.mark.parametrize(
+    ("kind", "wrong", "right"),
+    [("backend", "pybulet", "pybullet"), ("task", "peg_in_whole", "peg_in_hole")],
+)
+def test_a_wrong_name_on_the_command_line_is_a_usage_error(
+    run_pytest, tmp_path, kind, wrong, right
+):
+    result = run_pytest(tmp_path, f"--sart-{kind}", wrong)
     assert result.returncode == 4
-    assert "did you mean 'pybullet'" in result.stderr
+    assert f"did you mean {right!r}" in result.stderr
 
 
 def test_a_module_in_the_working_folder_is_found(run_pytest, tmp_path):
@@ -48,6 +56,32 @@ def test_by_default_all_our_backends_are_tested_with_the_usual_robots(run_pytest
     found = [line for line in result.stdout.splitlines() if "::" in line]
     targets = {line.partition("[")[2].rstrip("]") for line in found}
     assert targets == {f"{b}-{r}" for b in ("pybullet", "sapien") for r in USUAL_ROBOTS}
+
+
+def _collected(run_pytest, folder, *words):
+    """The file and the parameters of each test that would be run."""
+    result = run_pytest(folder, "--collect-only", "-q", *words)
+    found = [line for line in result.stdout.splitlines() if "::" in line]
+    return {(Path(f.partition("::")[0]).name, f.partition("[")[2].rstrip("]")) for f in found}
+
+
+def test_tasks_are_tested_where_they_are_named_and_on_the_backends_and_robots_named(
+    run_pytest, tmp_path
+):
+    task = ("--sart-task", "lid_closing", "-k", "at_rest")
+    found = _collected(run_pytest, tmp_path, *task)
+    assert found == {("test_tasks.py", f"lid_closing-{DEFAULT_BACKEND}")}
+    found = _collected(
+        run_pytest, tmp_path, *task, "--sart-backend", "sapien", "--sart-robot", "panda"
+    )
+    assert found == {("test_tasks.py", "lid_closing-sapien-panda")}
+
+
+def test_of_tasks_none_is_tested_where_backends_are_named_and_all_by_default(run_pytest, tmp_path):
+    named = _collected(run_pytest, tmp_path, "--sart-backend", "pybullet")
+    assert len(named) > 10 and "test_tasks.py" not in dict(named)
+    found = _collected(run_pytest, tmp_path, "-k", "at_rest")
+    assert found == {("test_tasks.py", f"{task}-{DEFAULT_BACKEND}") for task in TASKS}
 
 
 def test_pytest_finds_the_options_by_the_module_s_own_name():
