@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sart_toolkit.backends import BACKENDS, make_backend
+from sart_toolkit.backends import BACKENDS, DEFAULT_BACKEND, make_backend
 from sart_toolkit.bringup.skeleton import make_skeleton, write_source
 from sart_toolkit.errors import MissingExtra
 from sart_toolkit.robots import USUAL_ROBOTS, get_robot
@@ -83,7 +83,13 @@ def test_a_new_backend_keeps_the_contract_but_for_contacts(run_suite, tmp_path):
     assert {reason.split("lacks ")[1] for reason in outcome.skipped.values()} == {"SensesContacts"}
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "backend",
+    [
+        pytest.param(name, marks=[] if name == DEFAULT_BACKEND else [pytest.mark.slow])
+        for name in BACKENDS
+    ],
+)
 def test_our_tasks_and_those_of_one_s_own_keep_the_whole_contract(
     run_task_suite, backend, tmp_path
 ):
