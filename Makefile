@@ -72,5 +72,5 @@ $(VENV)/.setup-docs: $(VENV)/.setup
 
 $(VENV)/.setup-all: $(VENV)/.setup tools/setup_debian.sh
 	bash tools/setup_debian.sh annotate teleop
-	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate,modbus,teleop,annotate]'
+	$(PIP_INSTALL) -e '.[dev,sapien,planning,ray,formats,gym,calibrate,modbus,teleop,annotate,web]'
 	@touch $@

@@ -330,6 +330,23 @@ def probe_teleop_window() -> str:
     return f"{_version('pygame-ce')}, opens on display {os.environ.get('DISPLAY', '')}".strip()
 
 
+def probe_browser_page() -> str:
+    """What viser is, after it served a page to this machine."""
+    import socket
+    import urllib.request
+
+    import viser  # noqa: F401 - its absence has a remedy of its own
+
+    from sart_toolkit.record.webpage import WebPage
+
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        port = found.getsockname()[1]
+    with WebPage("sart doctor", port=port) as page, urllib.request.urlopen(page.url) as answer:
+        if b"<html" not in answer.read():
+            raise ProbeFailed(f"{page.url} answers with something else than a page")
+    return f"{_version('viser')}, serves a page"
+
+
 def probe_spacemouse() -> str:
     """What hidapi is, and whether it finds a SpaceMouse; none is no fault."""
     import hid
@@ -510,6 +527,13 @@ PROBES: Sequence[Probe] = (
         packages=("pygame-ce",),
         remedy="work on a desktop, or give it a virtual display: xvfb-run -a COMMAND (in a "
         f"checkout, to install that: {_SUDO}bash tools/setup_debian.sh teleop)",
+    ),
+    Probe(
+        "browser page",
+        "sart_toolkit.doctor:probe_browser_page",
+        extra="web",
+        packages=("viser",),
+        remedy="reinstall: pip install --force-reinstall viser; --text and windows work as well",
     ),
     Probe(
         "SpaceMouse",

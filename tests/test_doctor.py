@@ -48,6 +48,7 @@ def test_everything_is_checked(findings: list[Finding]) -> None:
         "Open3D off-screen",
         "Open3D window",
         "pygame window",
+        "browser page",
         "SpaceMouse",
         "CUDA",
         "threads",

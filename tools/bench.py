@@ -15,6 +15,8 @@ import io
 import itertools
 import json
 import os
+import shutil
+import socket
 import statistics
 import subprocess
 import sys
@@ -45,6 +47,7 @@ from sart_toolkit.collision.cloud import fuse_cloud
 from sart_toolkit.collision.exact import ExactWorld
 from sart_toolkit.collision.model import CollisionModel, PlacedModel
 from sart_toolkit.data import storage
+from sart_toolkit.data.assets import asset
 from sart_toolkit.data.dataset import Dataset
 from sart_toolkit.data.formats import FORMATS, get_format
 from sart_toolkit.data.formats.format import trajectories_of
@@ -85,6 +88,7 @@ from sart_toolkit.robots.visuals import shape_mesh
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
 from sart_toolkit.tasks import TASKS, get_task
 from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.testing.browser import Browser
 from sart_toolkit.testing.closest import ClosestPoints
 from sart_toolkit.testing.clutter import CLUTTER, Segment, random_segment
 from sart_toolkit.testing.desktop import Desktop
@@ -1300,6 +1304,68 @@ def bench_annotate(arguments: Sequence[str]) -> dict[str, Any]:
     }
 
 
+def bench_page(arguments: Sequence[str]) -> dict[str, Any]:
+    """Milliseconds from a key to what it changes, on the annotator's page in a browser.
+
+    `words`: until the panel says something else; `image`: until the browser has drawn two more
+    frames, the second of which shows what the first was told. Chromium without a window, 1400 x
+    900, on this machine; each key once what is computed ahead is computed.
+    """
+    parser = argparse.ArgumentParser(prog="bench.py page", description=bench_page.__doc__)
+    parser.add_argument("--repeats", type=int, default=2, help=f"of the {len(_KEYS)} keys")
+    options = parser.parse_args(arguments)
+    check_positive("--repeats", options.repeats)
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        port = found.getsockname()[1]
+    figures = []
+    with tempfile.TemporaryDirectory() as scratch, Browser(1400, 900) as browser:
+        demo = shutil.copy(asset("peg_in_hole/demo.h5"), scratch)
+        command = [sys.executable, "-m", "sart_toolkit", "annotate", demo, "--web"]
+        program = subprocess.Popen(
+            [*command, "--port", str(port)], stderr=subprocess.PIPE, text=True
+        )
+        assert program.stderr is not None
+        try:
+            next(line for line in program.stderr if "ssh" in line)
+            browser.open(f"http://127.0.0.1:{port}")
+            browser.wait_for("!!document.querySelector('.sart .message')")
+            browser.centre("button", "quit")
+            time.sleep(5.0)
+            for key in _KEYS * options.repeats:
+                name = {"Page Down": "PageDown", "Page Up": "PageUp"}.get(key, key)
+                if key in ("Left", "Right", "Up", "Down"):
+                    name = f"Arrow{key}"
+                words, image = browser.run(_TO_CHANGE % json.dumps(name))
+                _say(f"{key}: {words:.0f} ms, {image:.0f} ms")
+                figures.append((words, image))
+                time.sleep(1.0)
+        finally:
+            program.kill()
+            program.communicate()
+    return {
+        "words_ms": _spread([words for words, _ in figures]),
+        "image_ms": _spread([image for _, image in figures]),
+        "keys": len(figures),
+        "viser": importlib.metadata.version("viser"),
+    }
+
+
+_TO_CHANGE = """new Promise((resolve, reject) => {
+  const said = () => Array.from(document.querySelectorAll('.sart')).map(e => e.innerHTML).join();
+  const before = said(), start = performance.now();
+  setTimeout(() => reject('nothing changed within 20 s'), 20000);
+  const observer = new MutationObserver(() => {
+    if (said() === before) return;
+    observer.disconnect();
+    const words = performance.now() - start;
+    requestAnimationFrame(() => requestAnimationFrame(
+      () => resolve([words, performance.now() - start])));
+  });
+  observer.observe(document.body, {subtree: true, childList: true, characterData: true});
+  document.documentElement.dispatchEvent(new KeyboardEvent('keydown', {key: %s, bubbles: true}));
+})"""
+
+
 def _session(demonstration: Demonstration, scene: ExactWorld) -> AnnotationSession:
     session = AnnotationSession(demonstration, scene)
     _ = session.clearances
@@ -1387,6 +1453,7 @@ BENCHMARKS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {
     "dataset": bench_dataset,
     "draw": bench_draw,
     "formats": bench_formats,
+    "page": bench_page,
     "plan": bench_plan,
     "step": bench_step,
     "storage": bench_storage,

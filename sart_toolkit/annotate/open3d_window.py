@@ -19,12 +19,32 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from sart_toolkit.annotate.drawing import (
+    ACCENT,
+    BACKDROP,
+    CLEARANCES,
+    COLOURS,
+    FAINT,
+    INK,
+    NEAR,
+    PAPER,
+    PATH_COLOURS,
+    RIGHT,
+    TITLE,
+    TOWARDS_EYE,
+    fine_cloud,
+    ghost_gripper,
+    ghost_meshes,
+    gripper_at,
+    path_colours,
+    start_view,
+)
 from sart_toolkit.annotate.session import ACTIONS, AnnotationSession
 from sart_toolkit.annotate.verdict import Word
-from sart_toolkit.collision.cloud import CloudConfig, SceneCloud, fuse_cloud
+from sart_toolkit.collision.cloud import SceneCloud
 from sart_toolkit.data.records import Image, PrecisionSphere
 from sart_toolkit.errors import InvalidInput, MissingExtra
-from sart_toolkit.poses import Array, inverse
+from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals, shape_mesh
@@ -41,26 +61,8 @@ except ModuleNotFoundError as error:
 gui = open3d.visualization.gui
 rendering = open3d.visualization.rendering
 
-TITLE = "sart annotate"
-
-# Okabe and Ito's palette, distinct for colour-blind viewers; words stand beside all colours.
-_COLOURS: dict[Word, tuple[float, float, float]] = {
-    "safe": (0.00, 0.55, 0.40),
-    "tight": (0.88, 0.58, 0.00),
-    "colliding": (0.75, 0.10, 0.10),
-    "no room": (0.75, 0.10, 0.10),
-    "region": (0.00, 0.40, 0.70),
-}
-_INK, _FAINT, _PAPER, _BACKDROP = (0.13, 0.15, 0.19), (0.42, 0.45, 0.5), (0.97,) * 3, (0.93,) * 3
-_ACCENT = (0.55, 0.25, 0.60)
-# The path is coloured by clearance between these [m].
-_CLEARANCES = (0.0, 0.015, 0.05)
-_PATH_COLOURS = np.array([_COLOURS[word] for word in ("colliding", "tight", "safe")])
 _TRIAD_COLOURS = np.eye(3) * 0.75 + 0.1
-# From what is looked at to the eye at the start, and to the right as seen from there.
-_TOWARDS_EYE = np.array([0.55, -0.76, 0.35])
 _TOWARDS_LIGHT = np.array([0.48, -0.40, 0.78])
-_RIGHT = np.array([0.81, 0.59, 0.0])
 # Two requests to close the window within so many seconds are one.
 _ONE_PRESS = 0.3
 # Spheres listed, columns of keys.
@@ -104,10 +106,8 @@ def annotate_in_window(
         cloud: points to draw; fused from the demonstration's images if left out.
         config: how it is drawn.
     """
-    if cloud is None and any(c.depth.any() for c in session.demonstration.steps.cameras.values()):
-        # Twice as fine as for suggestions, which also count what is hidden.
-        fine = CloudConfig(voxel=CloudConfig().voxel / 2, unknown="free")
-        cloud = fuse_cloud(session.demonstration, robot, scene.held, config=fine)
+    if cloud is None:
+        cloud = fine_cloud(session.demonstration, robot, scene)
     drawn = RobotVisuals(RobotModel(robot, scene.held))
     with _quiet_stdout():
         window = AnnotationWindow(session, drawn, scene, cloud, config or WindowConfig())
@@ -152,7 +152,7 @@ class AnnotationWindow:
         self._window = self._application.create_window(TITLE, config.width, config.height)
         self._view = gui.SceneWidget()
         self._view.scene = rendering.Open3DScene(self._window.renderer)
-        self._view.scene.set_background([*_BACKDROP, 1.0])
+        self._view.scene.set_background([*BACKDROP, 1.0])
         # Colours as they are, and a fraction of the time on a CPU.
         drawing = self._view.scene.view
         drawing.set_post_processing(False)
@@ -243,22 +243,22 @@ class AnnotationWindow:
                     add(name, _shaded(mesh, T), _plain())
                     self._bodies.append((name, body.name))
         steps = self._session.demonstration.steps
-        gripper = float(np.clip(steps.measured_gripper[0], 0.0, 1.0))
+        gripper = gripper_at(self._session.demonstration, 0)
         Ts_joint = self._robot.poses_at(steps.joint_positions[0], gripper)
         for joint, meshes in self._robot.bodies.items():
             for i, mesh in enumerate(meshes):
                 add(f"robot {joint} {i}", _shaded(mesh, Ts_joint[joint]), _plain())
         Ts = self._session.demonstration.steps.measured_Ts_world_tool
-        add("path", _path(Ts[:, :3, 3], self._session.clearances), _line_material(5))
+        add("path", _path(Ts[:, :3, 3], path_colours(self._session)), _line_material(5))
         add("triads", _triads(Ts, 0.008), _line_material(1.5))
         add("triad", _triads(np.eye(4)[None], 0.05), _line_material(4))
-        add("convergence", _ball(0.004, _ACCENT), _plain())
+        add("convergence", _ball(0.004, ACCENT), _plain())
 
     def _update(self) -> None:
         """Draw what the session says now."""
         session, scene = self._session, self._view.scene
         steps, t = session.demonstration.steps, session.selected
-        gripper = float(np.clip(steps.measured_gripper[t], 0.0, 1.0))
+        gripper = gripper_at(session.demonstration, t)
         q = steps.joint_positions[t]
         Ts_joint = self._robot.poses_at(q, gripper)
         for joint, meshes in self._robot.bodies.items():
@@ -276,7 +276,7 @@ class AnnotationWindow:
             self._resets = session.view_resets
             self._reset_camera()
         elif session.follow:
-            self._look_at(steps.measured_Ts_world_tool[t][:3, 3], 0.45)
+            self._look_at(steps.measured_Ts_world_tool[t][:3, 3], NEAR)
         self._window.post_redraw()
 
     def _show_obstacles(self) -> None:
@@ -298,7 +298,7 @@ class AnnotationWindow:
             # Transparency is expensive on a CPU: only the current sphere has it.
             style = session.verdict(sphere).word, sphere is session.governing
             if self._drawn.get(i) != style:
-                colour, glass = _COLOURS[style[0]], style[1]
+                colour, glass = COLOURS[style[0]], style[1]
                 for name in (ball, rings):
                     scene.remove_geometry(name)
                 if glass:
@@ -321,8 +321,8 @@ class AnnotationWindow:
         scene.show_geometry("convergence", sphere is not None)
         here = session.sphere
         if here is not None:
-            beside = (here.radius + 0.01) * _RIGHT
-            self._label(here.T_world_key[:3, 3] + beside, f"{1e3 * here.radius:.1f} mm", _INK)
+            beside = (here.radius + 0.01) * RIGHT
+            self._label(here.T_world_key[:3, 3] + beside, f"{1e3 * here.radius:.1f} mm", INK)
         for i in range(session.config.ghosts):
             if scene.has_geometry(f"ghost {i}"):
                 scene.show_geometry(f"ghost {i}", False)
@@ -333,7 +333,7 @@ class AnnotationWindow:
             T = np.eye(4)
             T[:3, 3] = positions[t_star][:3, 3]
             scene.set_geometry_transform("convergence", T)
-            self._label(T[:3, 3] - 0.07 * _RIGHT, f"t* {t_star}", _ACCENT)
+            self._label(T[:3, 3] - 0.07 * RIGHT, f"t* {t_star}", ACCENT)
 
     def _label(self, p: Array, text: str, colour: Sequence[float]) -> None:
         label = self._view.add_3d_label(p, text)
@@ -341,17 +341,13 @@ class AnnotationWindow:
         self._labels.append(label)
 
     def _draw_ghosts(self, sphere: PrecisionSphere) -> None:
-        scene, steps = self._view.scene, self._session.demonstration.steps
-        gripper = float(np.clip(round(steps.measured_gripper[sphere.waypoint], 1), 0.0, 1.0))
+        scene, demonstration = self._view.scene, self._session.demonstration
+        gripper = ghost_gripper(demonstration, sphere)
         if gripper != self._ghost_gripper:
-            q = steps.joint_positions[sphere.waypoint]
-            T_tool_world = inverse(steps.measured_Ts_world_tool[sphere.waypoint])
             tool = open3d.geometry.TriangleMesh()
-            Ts = self._robot.poses_at(q, gripper)
-            for joint in self._robot.tool:
-                for mesh in self._robot.bodies[joint]:
-                    tool += _shaded(mesh, Ts[joint]).transform(T_tool_world @ Ts[joint])
-            tool.paint_uniform_color(_FAINT)
+            for mesh in ghost_meshes(self._robot, demonstration, sphere):
+                tool += _shaded(mesh, np.eye(4))
+            tool.paint_uniform_color(FAINT)
             tool = _textured(tool)
             for i in range(self._session.config.ghosts):
                 scene.remove_geometry(f"ghost {i}")
@@ -366,11 +362,10 @@ class AnnotationWindow:
     def _reset_camera(self) -> None:
         p = self._session.demonstration.steps.measured_Ts_world_tool[:, :3, 3]
         self._view.setup_camera(50.0, self._view.scene.bounding_box, p.mean(0))
-        size = float(np.linalg.norm(np.ptp(p, axis=0)))
-        self._look_at((p.min(0) + p.max(0)) / 2, max(0.55, 2.5 * size))
+        self._look_at(*start_view(self._session.demonstration))
 
     def _look_at(self, p: Array, distance: float) -> None:
-        self._view.look_at(p, p + distance * _TOWARDS_EYE, [0, 0, 1])
+        self._view.look_at(p, p + distance * TOWARDS_EYE, [0, 0, 1])
         self._view.center_of_rotation = p
 
     def _layout(self, context: Any) -> None:
@@ -387,7 +382,7 @@ class _Panel:
         self._images = None if camera is None else camera.rgb
         self._size = round(14 * em)
         self._side = gui.Vert(0.3 * em, gui.Margins(0.8 * em))
-        self._side.background_color = gui.Color(*_PAPER)
+        self._side.background_color = gui.Color(*PAPER)
         self._image = gui.ImageWidget(_image(np.full((1, 1, 3), 230, np.uint8), self._size))
         self._side.add_fixed(0.8 * em)
         row = gui.Horiz()
@@ -396,30 +391,30 @@ class _Panel:
         row.add_stretch()
         self._side.add_child(row)
         row = gui.Horiz(em)
-        _label(row, "\n".join(self._state_lines()), _FAINT)
-        self._state = _label(row, "", _INK)
+        _label(row, "\n".join(self._state_lines()), FAINT)
+        self._state = _label(row, "", INK)
         self._side.add_child(row)
-        self._verdict = _label(self._side, "\n", _INK)
-        self._head = _label(self._side, "", _INK)
-        self._rows = [_label(self._side, "", _INK, mono) for _ in range(_ROWS)]
+        self._verdict = _label(self._side, "\n", INK)
+        self._head = _label(self._side, "", INK)
+        self._rows = [_label(self._side, "", INK, mono) for _ in range(_ROWS)]
         self._side.add_stretch()
         row = gui.Horiz(0.5 * em)
-        _label(row, "path, clear by", _FAINT, small)
-        for clearance, colour in zip(_CLEARANCES, _PATH_COLOURS, strict=True):
+        _label(row, "path, clear by", FAINT, small)
+        for clearance, colour in zip(CLEARANCES, PATH_COLOURS, strict=True):
             _label(row, f"{1e3 * clearance:.0f} mm", colour, small)
-        _label(row, "or more", _FAINT, small)
+        _label(row, "or more", FAINT, small)
         self._side.add_child(row)
         self._message_box = gui.Vert(0, gui.Margins(0.6 * em, 0.4 * em))
-        self._message_box.background_color = gui.Color(*_INK)
+        self._message_box.background_color = gui.Color(*INK)
         self._message = _label(self._message_box, "", (1, 1, 1))
         self._keys = gui.Horiz(0.5 * em, gui.Margins(0.6 * em, 0.3 * em))
-        self._keys.background_color = gui.Color(*_PAPER)
+        self._keys.background_color = gui.Color(*PAPER)
         rows = [(a.keys[0], a.help) for a in ACTIONS.values() if a.keys]
         self._n_key_rows = -(-len(rows) // _KEY_COLUMNS)
         for first in range(0, len(rows), self._n_key_rows):
             keys, texts = zip(*rows[first : first + self._n_key_rows], strict=True)
-            _label(self._keys, "\n".join(keys), _INK, small)
-            _label(self._keys, "\n".join(texts), _FAINT, small)
+            _label(self._keys, "\n".join(keys), INK, small)
+            _label(self._keys, "\n".join(texts), FAINT, small)
             self._keys.add_stretch()
         self.widgets = (self._side, self._message_box, self._keys)
 
@@ -437,7 +432,7 @@ class _Panel:
         )
         here = session.sphere
         self._verdict.text = textwrap.fill(session.state()["verdict"], 40)
-        colour = _INK if here is None else _COLOURS[session.verdict(here).word]
+        colour = INK if here is None else COLOURS[session.verdict(here).word]
         self._verdict.text_color = gui.Color(*colour)
         unsaved = ", not saved" if session.dirty else ""
         self._head.text = f"{len(session.spheres)} spheres{unsaved}"
@@ -450,7 +445,7 @@ class _Panel:
                 word = session.verdict(sphere).word
                 mark, radius = ">" if sphere is here else " ", 1e3 * sphere.radius
                 label.text = f"{mark}{sphere.waypoint:>4} {radius:>6.1f} mm  {word}"
-                label.text_color = gui.Color(*_COLOURS[word])
+                label.text_color = gui.Color(*COLOURS[word])
         self._message.text = session.message or "A suggests all spheres, Enter adds one here"
         self._window.set_needs_layout()
 
@@ -572,10 +567,7 @@ def _point_cloud(cloud: SceneCloud, rows: NDArray[np.int64]) -> Any:
     return made
 
 
-def _path(p: Array, clearances: Array) -> Any:
-    colours = np.stack(
-        [np.interp(clearances, _CLEARANCES, channel) for channel in _PATH_COLOURS.T], axis=1
-    )
+def _path(p: Array, colours: Array) -> Any:
     return _lines(p, [[i, i + 1] for i in range(len(p) - 1)], (colours[:-1] + colours[1:]) / 2)
 
 

@@ -15,6 +15,7 @@ from sart_toolkit.cli.arguments import Annotate
 from sart_toolkit.cli.console import say
 from sart_toolkit.cli.sensor import declared_sensor
 from sart_toolkit.cli.suggest import describe_spheres
+from sart_toolkit.cli.web import check_web
 from sart_toolkit.data.records import Annotation, Demonstration
 from sart_toolkit.data.storage import (
     Journal,
@@ -34,12 +35,13 @@ if TYPE_CHECKING:
     from sart_toolkit.annotate.session import AnnotationSession
     from sart_toolkit.collision.sensor import SensorErrors
 
-_WITHOUT = "or work without a window: --text, or --suggest-all --no-window"
+_WITHOUT = "or work without a window: --web, --text, or --suggest-all --no-window"
 
 
 def annotate_verb(args: Annotate) -> dict[str, Any]:
     """`sart annotate`."""
     pipeline.check_names(task=args.task, robot=args.robot, backend=args.backend)
+    check_web(args, "--text" if args.text else "--no-window" if args.no_window else "")
     sensor = declared_sensor(args, [args.demo])
     headless = args.no_window and not args.text
     if headless and not args.suggest_all:
@@ -52,7 +54,7 @@ def annotate_verb(args: Annotate) -> dict[str, Any]:
 def _annotate(
     args: Annotate, out: Path, headless: bool, lock: OutputLock, sensor: SensorErrors | None
 ) -> dict[str, Any]:
-    with _window_probe(wanted=not (args.text or args.no_window)) as probe:
+    with _window_probe(wanted=not (args.text or args.no_window or args.web)) as probe:
         demonstration = pipeline.noted(load_demonstration(args.demo), args.task, args.robot)
         # Not before the demonstration is read: these imports take a second.
         from sart_toolkit.annotate.session import AnnotateConfig, AnnotationSession
@@ -103,6 +105,8 @@ def _annotate(
         elif headless:
             session.perform("save")
             _check_done(session)
+        elif args.web:
+            _web_mode(session, args)
         else:
             _window_mode(session)
     doubtful = [] if session.dirty else session.unproved
@@ -156,3 +160,10 @@ def _window_mode(session: AnnotationSession) -> None:
     demonstration = session.demonstration
     scene = pipeline.task_of(demonstration).scene
     window.annotate_in_window(session, pipeline.robot_of(demonstration), scene)
+
+
+def _web_mode(session: AnnotationSession, args: Annotate) -> None:
+    browser = importlib.import_module("sart_toolkit.annotate.browser")
+    demonstration = session.demonstration
+    scene, robot = pipeline.task_of(demonstration).scene, pipeline.robot_of(demonstration)
+    browser.annotate_in_browser(session, robot, scene, args.host, args.port, say)

@@ -428,11 +428,20 @@ class Suggest:
     json: _JSON = False
 
 
+_WEB = Annotated[bool, arg(help="In a browser, also another computer's over ssh.")]
+_HOST = Annotated[
+    str | None, _optional("ADDRESS", "Where --web is reached; 127.0.0.1, this computer only.")
+]
+_PORT = Annotated[int | None, _optional("PORT", "Port of --web; 8080.")]
+
+
 @dataclass(frozen=True)
 class Annotate:
-    """Annotate a demonstration with precision spheres: in a window, in words, or headless.
+    """Annotate a demonstration with precision spheres: in a window, a browser, words, or headless.
 
     Example: sart annotate demo.h5
+
+    Example: sart annotate demo.h5 --web
 
     Example: sart annotate demo.h5 --text
 
@@ -453,6 +462,9 @@ class Annotate:
     no_window: Annotated[bool, arg(help="Save what is suggested at once, without a window.")] = (
         False
     )
+    web: _WEB = False
+    host: _HOST = None
+    port: _PORT = None
     show: Annotated[
         Literal["cloud", "scene"], arg(help="What is drawn first: recorded points, or meshes.")
     ] = "cloud"
