@@ -90,9 +90,7 @@ class AugmentConfig:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> AugmentConfig:
         """The settings that `to_json` wrote."""
-        # Until there was a choice, each pose was drawn on its own.
-        sampling = SamplingConfig(**{"antithetic": False, **values["sampling"]})
-        cloud = CloudConfig()
+        sampling, cloud = SamplingConfig(**values["sampling"]), CloudConfig()
         if "cloud" in values:
             cloud = CloudConfig.from_json(values["cloud"])
         return cls(**{**values, "sampling": sampling, "cloud": cloud})

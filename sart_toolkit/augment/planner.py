@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from sart_toolkit.augment import get_strategy
@@ -16,7 +14,6 @@ from sart_toolkit.collision.phases import BODY_STILLNESS, OUT_AND_BACK_STILLNESS
 from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.pace import Pace
 from sart_toolkit.data.records import Annotation, Demonstration
-from sart_toolkit.data.sampling import antithetic_pose
 from sart_toolkit.errors import MotionRejected, Unreachable
 from sart_toolkit.motion.controller import settling_targets
 from sart_toolkit.motion.line import straight_line
@@ -62,18 +59,12 @@ class SegmentPlanner:
     def proposal(self, sphere: int, k: int) -> tuple[Proposal, np.random.Generator]:
         """The k-th draw from a sphere, and the random numbers that follow.
 
-        Their seed is (seed, sphere, k, source), with k // 4 for what is drawn in fours.
+        Their seed is (seed, sphere, k, source).
         """
-        strategy, sampling = get_strategy(self._config.strategy), self._config.sampling
-        in_fours = sampling.antithetic and strategy.symmetric
-        seed = [self._config.seed, sphere, k // 4 if in_fours else k, self._source]
-        rng = np.random.default_rng(seed)
-        drawn = strategy.propose(self.world.demonstration, self._spheres, sphere, rng, sampling)
-        if not in_fours:
-            return drawn, rng
-        T_key = self._spheres[sphere].T_world_key
-        T_sampled = antithetic_pose(T_key, drawn.T_world_sampled, k)
-        return dataclasses.replace(drawn, T_world_sampled=T_sampled), rng
+        rng = np.random.default_rng([self._config.seed, sphere, k, self._source])
+        strategy = get_strategy(self._config.strategy)
+        demonstration, sampling = self.world.demonstration, self._config.sampling
+        return strategy.propose(demonstration, self._spheres, sphere, rng, sampling), rng
 
     @property
     def stillness(self) -> float:

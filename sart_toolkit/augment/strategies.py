@@ -56,8 +56,6 @@ class Strategy(abc.ABC):
             demonstrations.
         annotated: whether it draws from an annotation's spheres.
         plans: whether a segment whose straight line is blocked may bend round obstacles.
-        symmetric: whether poses are as likely mirrored through a sphere's key pose, in position
-            and in rotation; only then they are drawn in fours, see `SamplingConfig.antithetic`.
         policy: the policy that its datasets are for, if no other is asked for.
         n: trajectories in a dataset, if no other number is asked for.
     """
@@ -65,7 +63,6 @@ class Strategy(abc.ABC):
     draws: bool = True
     annotated: bool = True
     plans: bool = False
-    symmetric: bool = False
     policy: str = "compact_mlp"
     n: int = 40
 
@@ -156,9 +153,6 @@ def sample_by_kind(
     return draw(sphere, rng, config)
 
 
-_SYMMETRIC = (sample_pose, sample_position, sample_turn, sample_in_region, sample_by_kind)
-
-
 @dataclass(frozen=True)
 class SphereStrategy(Strategy):
     """A pose drawn for a sphere, and a waypoint at which the demonstration is rejoined.
@@ -176,11 +170,6 @@ class SphereStrategy(Strategy):
     rejoin: Rejoin = leaving
     merged: bool = True
     plans: bool = False
-
-    @property
-    def symmetric(self) -> bool:  # type: ignore[override]
-        """Whether `draw` is one of those here; of another, a subclass may say so."""
-        return self.draw in _SYMMETRIC
 
     def propose(
         self,

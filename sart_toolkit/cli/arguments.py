@@ -534,14 +534,6 @@ class Augment:
     rotation_per_metre: Annotated[
         float, arg(help="Largest rotation per metre of radius, nu_r [rad/m].")
     ] = 2.0
-    antithetic: Annotated[
-        bool,
-        arg(
-            help="Draw poses in fours: mirrored through the sphere's key pose in position, in "
-            "rotation and in both, so that turns don't go with offsets by chance. Each on its own, "
-            "as in the paper, with --no-antithetic."
-        ),
-    ] = True
     duration: Annotated[
         float | None,
         _optional(

@@ -38,7 +38,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
         **({} if args.n is None else {"n": args.n}),
         "allocation": args.allocation,
         "strategy": args.strategy,
-        "sampling": SamplingConfig(args.distribution, args.rotation_per_metre, args.antithetic),
+        "sampling": SamplingConfig(args.distribution, args.rotation_per_metre),
         "duration": args.duration,
         "execution": args.execution,
         "recording": args.recording,

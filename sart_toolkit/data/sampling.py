@@ -15,15 +15,10 @@ DISTRIBUTIONS = ("paper", "area")
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """How poses are drawn.
-
-    `distribution` of positions, `rotation_per_metre` nu_r [rad/m]. `antithetic`: in fours, see
-    `antithetic_pose`; else each on its own, as in the paper.
-    """
+    """How poses are drawn: `distribution` of positions, `rotation_per_metre` nu_r [rad/m]."""
 
     distribution: str = "area"
     rotation_per_metre: float = ROTATION_PER_METRE
-    antithetic: bool = True
 
     def __post_init__(self) -> None:
         if self.distribution not in DISTRIBUTIONS:
@@ -32,25 +27,6 @@ class SamplingConfig:
             raise InvalidInput(
                 f"rotation_per_metre: expected a finite number >= 0, got {self.rotation_per_metre}"
             )
-
-
-def antithetic_pose(T_world_key: Array, T_world_sampled: Array, k: int) -> Array:
-    """The k-th of the four poses `(4, 4)` that a drawn one stands for, in the world.
-
-    With p = c + d and R = C dR of the drawn pose, c and C of the key pose: (d, dR), (-d, dR),
-    (d, dR^-1), (-d, dR^-1), then the same again. Over each two, where the tool is says nothing of
-    how it is turned; over all four neither is on average off the key pose. Of ten or so poses drawn
-    on their own, a policy learns how turns happened to go with offsets, and turns the tool for no
-    reason. Antithetic variates: Hammersley and Morton, Mathematical Proceedings of the Cambridge
-    Philosophical Society 52, 1956.
-    """
-    c, C = T_world_key[:3, 3], T_world_key[:3, :3]
-    T = np.array(T_world_sampled)
-    if k % 2:
-        T[:3, 3] = 2 * c - T[:3, 3]
-    if k // 2 % 2:
-        T[:3, :3] = orthonormalised(C @ T[:3, :3].T @ C)
-    return T
 
 
 def sample_direction(rng: np.random.Generator, distribution: str) -> Array:
