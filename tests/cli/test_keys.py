@@ -2,6 +2,7 @@
 
 import os
 import pty
+import select
 import subprocess
 import sys
 import termios
@@ -30,11 +31,17 @@ def terminal():
     os.close(there)
 
 
-def _says(here, text):
-    said = b""
-    while text.encode() not in said:
-        said += os.read(here, 4096)
-    return said.decode()
+class _Reader:
+    """What a program says, in order: several of its lines may come at once."""
+
+    def __init__(self, here):
+        self._here, self._left = here, b""
+
+    def until(self, text):
+        while text.encode() not in self._left:
+            assert select.select([self._here], [], [], 30)[0], f"not within 30 s: {text}"
+            self._left += os.read(self._here, 4096)
+        self._left = self._left.partition(text.encode())[2]
 
 
 @pytest.mark.parametrize("end", ["raise", "ctrl-c"])
@@ -47,14 +54,15 @@ def test_keys_come_one_by_one_without_enter_and_the_terminal_is_as_it_was(termin
         stdin=there, stdout=there, stderr=there, start_new_session=True,
         preexec_fn=lambda: __import__("fcntl").ioctl(0, termios.TIOCSCTTY, 0),
     )  # fmt: skip
-    _says(here, "ready")
+    reader = _Reader(here)
+    reader.until("ready")
     os.write(here, b" ")
-    _says(here, "' '")
-    _says(here, "''")
+    reader.until("' '")
+    reader.until("''")
     os.write(here, b"\x7f")
-    _says(here, r"'\x7f'")
+    reader.until(r"'\x7f'")
     if end == "ctrl-c":
         os.write(here, b"\x03")
-        _says(here, "KeyboardInterrupt")
+        reader.until("KeyboardInterrupt")
     assert process.wait(20) != 0
     assert termios.tcgetattr(there) == before
