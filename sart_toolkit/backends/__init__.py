@@ -10,11 +10,11 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, TypeGuard
 
-from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.registry import expect_class, resolve
 
 if TYPE_CHECKING:
     from sart_toolkit.backends.interface import Backend
+    from sart_toolkit.data.records import Rates
     from sart_toolkit.robots.spec import ImageSize, RobotSpec
     from sart_toolkit.scenes.spec import SceneSpec
 
@@ -52,7 +52,7 @@ def make_backend(
     robot: RobotSpec,
     scene: SceneSpec,
     image_size: ImageSize = 128,
-    rates: Rates = DEFAULT_RATES,
+    rates: Rates | None = None,
 ) -> Backend:
     """A backend with the robot and scene loaded.
 
@@ -61,9 +61,12 @@ def make_backend(
         robot: the robot.
         scene: what surrounds it.
         image_size: width and height of images [pixels]; one number for a square.
-        rates: how often it is commanded, measured and recorded.
+        rates: how often it is commanded, measured and recorded; by default if left out.
 
     Raises:
         UnknownName: no such backend; the message says which part is wrong.
     """
-    return get_backend(backend)(robot, scene, image_size, rates)
+    # Not above: this is imported for names alone, too.
+    from sart_toolkit.data.records import DEFAULT_RATES
+
+    return get_backend(backend)(robot, scene, image_size, rates or DEFAULT_RATES)
