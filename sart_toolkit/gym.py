@@ -57,8 +57,9 @@ class SartEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
     """A task on a backend: images and gripper in, relative tool poses out.
 
     Observation: `pixels`, of each camera an image uint8 `(H, W, 3)` by its name, and `agent_pos`,
-    float32 `(2,)`: the measured gripper in [0, 1] (0 open) and its rate [1/s]. Neither joints nor
-    absolute poses, as for our own policies.
+    float32 `(5,)`: the measured gripper in [0, 1] (0 open), its rate [1/s], and how the tool is
+    tilted, as the world's upward direction in its frame. Neither joints nor absolute poses, as for
+    our own policies.
 
     Action, float32 `(7,)`: as everywhere in the toolkit, the next commanded tool pose relative to
     the present one, xyz [m] and rotation vector [rad] in the tool frame, then the gripper target in
@@ -138,8 +139,8 @@ class SartEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
                 name: spaces.Box(0, 255, (height, width, 3), np.uint8) for name in self._cameras
             }),
             "agent_pos": spaces.Box(
-                np.array([0.0, -rates.record_hz], np.float32),
-                np.array([1.0, rates.record_hz], np.float32),
+                np.array([0.0, -rates.record_hz, -1.0, -1.0, -1.0], np.float32),
+                np.array([1.0, rates.record_hz, 1.0, 1.0, 1.0], np.float32),
             ),
         })  # fmt: skip
         # No farther than a command may lead in each control period.
@@ -238,7 +239,10 @@ class SartEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         now, before = np.clip([seen.gripper, gripper_before], 0.0, 1.0)
         return {
             "pixels": {name: seen.cameras[name].rgb.copy() for name in self._cameras},
-            "agent_pos": np.array([now, (now - before) * self._rates.record_hz], np.float32),
+            "agent_pos": np.array(
+                [now, (now - before) * self._rates.record_hz, *np.clip(seen.up, -1.0, 1.0)],
+                np.float32,
+            ),
         }
 
     def _info(self, achieved: bool, reason: str | None = None) -> dict[str, Any]:

@@ -159,6 +159,11 @@ def inverse(T: Array) -> Array:
     return result
 
 
+def up_in_tool(Ts_world_tool: Array) -> Array:
+    """The world's upward direction `(..., 3)` in the tool frames of poses `(..., 4, 4)`."""
+    return Ts_world_tool[..., 2, :3]
+
+
 def exp_rotation(rotvec: Array) -> Array:
     """The rotation matrix `(3, 3)` of a rotation vector `(3,)` [rad] (Rodrigues' formula)."""
     angle = float(np.sqrt(rotvec @ rotvec))

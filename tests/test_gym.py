@@ -128,7 +128,8 @@ def test_a_skill_is_a_policy(peg_dataset, tmp_path, env):
     skill.reset()
     acted = skill(observation)
     skill.reset()
-    direct = skill.act(observation["pixels"], float(observation["agent_pos"][0]))
+    gripper, _, *up = observation["agent_pos"]
+    direct = skill.act(observation["pixels"], float(gripper), up)
     assert np.array_equal(acted, direct) and acted.shape == (7,)
     assert len(env.step(acted)) == 5
 
@@ -140,7 +141,7 @@ def test_several_run_side_by_side(mode):
     )
     observation, _ = envs.reset(seed=5)
     assert observation["pixels"]["wrist"].shape == (2, 48, 48, 3)
-    assert observation["agent_pos"].shape == (2, 2)
+    assert observation["agent_pos"].shape == (2, 5)
     *_, info = envs.step(np.zeros((2, 7), np.float32))
     assert info["is_success"].tolist() == [False, False]
     envs.close()

@@ -14,6 +14,7 @@ import importlib.metadata
 import io
 import itertools
 import json
+import math
 import os
 import shutil
 import socket
@@ -65,11 +66,12 @@ from sart_toolkit.data.storage import load_demonstration, save_demonstration
 from sart_toolkit.data.writer import write_dataset
 from sart_toolkit.errors import InvalidInput, MotionRejected, SartError, Unreachable, unknown_name
 from sart_toolkit.learn.frames import input_size
-from sart_toolkit.learn.policies import POLICIES
+from sart_toolkit.learn.policies import POLICIES, get_policy
 from sart_toolkit.learn.samples import FRAMES, Batch, WindowConfig, Windows, open_windows
 from sart_toolkit.learn.training import (
     TrainConfig,
     build_policy,
+    epoch_batches,
     make_optimizer,
     resolve_bfloat16,
     resolve_device,
@@ -138,12 +140,13 @@ def bench_train(arguments: Sequence[str]) -> dict[str, Any]:
 
 def _train_figures(config: TrainConfig, n_blocks: int, seconds: float) -> dict[str, Any]:
     device = resolve_device(config.device)
-    window_config = WindowConfig(config.cameras, config.image_size, config.history)
+    window_config = WindowConfig(
+        config.cameras, config.image_size, config.history, config.image_shift
+    )
     with tempfile.TemporaryDirectory() as scratch:
-        few = _synthetic_dataset(Path(scratch) / "dataset", 2)
-        windows = open_windows(few, window_config, Path(scratch))
-    first = torch.arange(config.batch_size) % len(windows.history)
-    bare_step = _stepper(config, itertools.repeat(windows.to(device).batch(first)))
+        few = _synthetic_dataset(Path(scratch) / "dataset", 8)
+        windows = open_windows(few, window_config, Path(scratch)).to(device)
+    bare_step = _stepper(config, itertools.repeat(next(_random_batches(config, windows))))
     # The first steps choose and compile kernels.
     step_seconds = [bare_step() for _ in range(6)]
     per_block = max(2, round(seconds / (2 * statistics.median(step_seconds[2:]) * n_blocks)))
@@ -396,14 +399,14 @@ def bench_training_data(arguments: Sequence[str]) -> dict[str, Any]:
 
 def _random_batches(config: TrainConfig, windows: Windows) -> Iterator[Batch]:
     """Batches as the training loop draws them, epoch after epoch."""
-    size = config.batch_size
+    n_batches = math.ceil(int(windows.multiplicity.sum()) / config.batch_size)
+    shared = get_policy(config.policy).shares_pictures
     for epoch in itertools.count():
-        rng = np.random.default_rng([config.seed, epoch])
-        order = torch.from_numpy(windows.epoch_order(rng))
-        offsets = torch.from_numpy(rng.integers(0, 2 * config.image_shift + 1, (len(order), 2)))
-        for start in range(0, len(order) - size + 1, size):
-            windows.will_need(order[start + size : start + 2 * size])
-            yield windows.batch(order[start : start + size], offsets[start : start + size])
+        batches = epoch_batches(windows, config, epoch, n_batches)
+        for i, (some, variation) in enumerate(batches):
+            if i + 1 < n_batches:
+                windows.will_need(batches[i + 1][0])
+            yield windows.batch(some, variation, shared)
 
 
 def _memory(name: str) -> int:

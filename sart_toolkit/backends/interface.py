@@ -18,7 +18,7 @@ import numpy as np
 
 from sart_toolkit.data.records import DEFAULT_RATES, DepthImage, Image, Rates
 from sart_toolkit.errors import MissingCapability, unknown_name
-from sart_toolkit.poses import Array
+from sart_toolkit.poses import Array, up_in_tool
 from sart_toolkit.robots.spec import CameraSpec, ImageSize, RobotSpec, check_image_size
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
 
@@ -55,6 +55,11 @@ class Observation:
     cameras: Mapping[str, CameraView] = field(default_factory=dict)
     Ts_world_body: Mapping[str, Array] = field(default_factory=dict)
     joint_path: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def up(self) -> Array:
+        """How the tool is tilted: the world's upward direction `(3,)` in the tool frame."""
+        return up_in_tool(self.T_world_tool)
 
     def __post_init__(self) -> None:
         if len(self.joint_path) == 0:

@@ -78,7 +78,7 @@ def deploy_skill(
     for _ in range(max(1, round(seconds * record_hz))):
         began = time.perf_counter()
         images = {name: observation.cameras[name].rgb for name in skill.cameras}
-        action = skill.act(images, observation.gripper)
+        action = skill.act(images, observation.gripper, observation.up)
         decisions.append(time.perf_counter() - began)
         desired, gripper = apply_action(controller.commanded_T_world_tool, action)
         try:

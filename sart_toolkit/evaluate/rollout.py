@@ -206,7 +206,7 @@ def run_rollout(
     while step < round(task.horizon * record_hz):
         seen = arriving[0]
         images = {name: seen.cameras[name].rgb for name in skill.cameras}
-        action = skill.act(images, seen.gripper)
+        action = skill.act(images, seen.gripper, seen.up)
         desired, gripper = apply_action(controller.commanded_T_world_tool, action)
         try:
             targets = controller.move(desired, observation.T_world_tool, rates.control_per_record)

@@ -137,12 +137,12 @@ class Frames:
         return Frames({k: v.to(device, copy=True) for k, v in self.images.items()}, self.layout)
 
     def gather(self, at: Tensor, offsets: Tensor | None = None) -> dict[str, Tensor]:
-        """Images uint8 `(B, K, 3, H, W)` by camera, channels-last in memory.
+        """Images uint8 `(M, 3, H, W)` by camera, channels-last in memory.
 
         Args:
-            at: which steps, int64 `(B, K)`.
-            offsets: rows and columns, int64 `(B, 2)` in 0..2 pad, at which each row's images are
-                cut from the padded ones: the same for all of them. In the middle when left out.
+            at: which steps, int64 `(M,)`.
+            offsets: row and column, int64 `(M, 2)` in 0..2 pad, at which each is cut from the
+                padded one. In the middle when left out.
         """
         images = {camera: self._gather(camera, at, offsets) for camera in self.images}
         self._gathered += at.numel() * (self.layout.frame_bytes + 2 * _FAULT_AROUND)
@@ -154,13 +154,13 @@ class Frames:
         images, pad = self.images[camera], self.layout.pad
         height, width = self.layout.sizes[camera]
         if pad == 0:
-            cut = images.index_select(0, at.flatten()).unflatten(0, at.shape)
+            cut = images.index_select(0, at)
         elif offsets is None:
-            cut = images[at][:, :, pad : pad + height, pad : pad + width]
+            cut = images[at][:, pad : pad + height, pad : pad + width]
         else:
             cuts = images.unfold(1, height, 1).unfold(2, width, 1).permute(0, 1, 2, 4, 5, 3)
-            cut = cuts[at, offsets[:, :1], offsets[:, 1:]]
-        return cut.permute(0, 1, 4, 2, 3)
+            cut = cuts[at, offsets[:, 0], offsets[:, 1]]
+        return cut.permute(0, 3, 1, 2)
 
     def will_need(self, at: Tensor) -> None:
         """Have the disk read steps while something else is computed, if they lie there."""

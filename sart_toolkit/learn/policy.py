@@ -31,24 +31,31 @@ class PolicySetup:
 
 
 class Policy(nn.Module, ABC):
-    """Actions from a history of images and gripper openings.
+    """Actions from a history of images and gripper openings, and from how the tool is tilted.
 
     An observation is named tensors: `images/<camera>` uint8 `(B, K, 3, H, W)` for each camera
     (fastest when each image is channels-last in memory) and `gripper` `(B, K)` in [0, 1], both
-    oldest first. A training batch also has `action` `(B, 7)`: xyz [m], rotation vector [rad], tool
-    frame, and gripper target in [0, 1]; or `(B, chunk, 7)`, the actions that follow each other,
-    where the class says `chunk` > 1. All are in recorded units.
+    oldest first; and `up` `(B, 3)`, the world's upward direction in the tool frame now: how the
+    tool is tilted, which a picture of a few objects tells badly and which, unlike the rest of its
+    pose, says nothing of where the object stands. A training batch also has `action` `(B, 7)`: xyz
+    [m], rotation vector [rad], tool frame, and gripper target in [0, 1]; or `(B, chunk, 7)`, the
+    actions that follow each other, where the class says `chunk` > 1. All are in recorded units.
+    Where it says `shares_pictures`, a training batch has `pictures/<camera>` `(M, 3, H, W)`, each
+    different picture once, and `pictures` `(B, K)`, which of them each window has, instead of
+    `images/<camera>`.
 
     A subclass is built from a `PolicySetup`. Means and scales of the data lie in buffers, hence in
     the state dict, once `set_normalisation` was called.
 
     Attributes:
         chunk: actions that a training batch holds for each observation.
+        shares_pictures: whether a training batch holds each different picture once.
         norms: what `TrainConfig.norm` may be.
         train_defaults: the options of `TrainConfig` that suit it on a CPU.
     """
 
     chunk: ClassVar[int] = 1
+    shares_pictures: ClassVar[bool] = False
     norms: ClassVar[tuple[str, ...]] = ("none",)
     train_defaults: ClassVar[Mapping[str, Any]] = {
         "epochs": 100,
@@ -62,6 +69,7 @@ class Policy(nn.Module, ABC):
     }
     gripper_mean: Tensor
     gripper_std: Tensor
+    up_mean: Tensor
     action_mean: Tensor
     action_std: Tensor
 
@@ -70,6 +78,7 @@ class Policy(nn.Module, ABC):
         self.setup = setup
         self.register_buffer("gripper_mean", torch.zeros(1))
         self.register_buffer("gripper_std", torch.ones(1))
+        self.register_buffer("up_mean", torch.zeros(3))
         self.register_buffer("action_mean", torch.zeros(ACTION_SIZE))
         self.register_buffer("action_std", torch.ones(ACTION_SIZE))
 

@@ -33,7 +33,7 @@ from sart_toolkit.data.storage import check_room, remove, replacing
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
 from sart_toolkit.learn.frames import FrameLayout, Frames, input_size
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
-from sart_toolkit.poses import Array
+from sart_toolkit.poses import Array, up_in_tool
 
 FRAMES, SAMPLES = "frames.bin", "samples.safetensors"
 
@@ -56,16 +56,22 @@ _EVENT = 4.0
 # what the demonstration's mostly do for as much motion, up to so many steps at its pace. And the
 # least that one counts.
 _TOLD, _TOLD_STEPS, _LEAST_TOLD = 0.5, 5, 0.02
+# Changes when the files do.
+_LAYOUT = 2
 # In a step, of the gripper's range.
 _COMMAND_CHANGE, _GRIPPER_MOTION = 0.1, 0.02
 
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Means and scales of the measured gripper (1,) and of the actions (7,), in recorded units."""
+    """Means and scales of the measured gripper (1,) and of the actions (7,), in recorded units.
+
+    And the mean `up_mean (3,)` of the upward direction.
+    """
 
     gripper_mean: Array
     gripper_std: Array
+    up_mean: Array
     action_mean: Array
     action_std: Array
 
@@ -91,10 +97,27 @@ class WindowConfig:
 
 
 @dataclass(frozen=True)
+class Variation:
+    """How each of a batch's windows is varied.
+
+    `offsets (B, 2)` int64: the row and column in 0..2 `image_shift` at which its images are cut.
+    `runs (B,)` int64: windows of one run are varied alike and share images.
+    """
+
+    offsets: Tensor
+    runs: Tensor
+
+    def to(self, device: torch.device) -> Variation:
+        """The same in the memory of a device."""
+        return Variation(self.offsets.to(device), self.runs.to(device))
+
+
+@dataclass(frozen=True)
 class Windows:
     """All distinct windows of a dataset.
 
-    `frames`: each step's images, once. `gripper (F,)` float32: the gripper measured with them.
+    `frames`: each step's images, once. `gripper (F,)` float32: the gripper measured with them;
+    `up (F, 3)` float32: the world's upward direction in the tool frame.
     `history (U, K)` int64: each window's steps, oldest first. `actions (U, 7)` float32, or
     `(U, chunk, 7)`. `multiplicity (U,)` int64: how many trajectories contribute the window.
     `activity (U,)` float32: how much happens in it, from 0.1 where the tool stands still to 1
@@ -106,6 +129,7 @@ class Windows:
 
     frames: Frames
     gripper: Tensor
+    up: Tensor
     history: Tensor
     actions: Tensor
     multiplicity: Tensor
@@ -121,40 +145,64 @@ class Windows:
     def to(self, device: torch.device) -> Windows:
         """The same windows, with a copy of all images, in the memory of a device."""
         moved = {
-            name: getattr(self, name).to(device)
-            for name in ("frames", "gripper", "history", "actions", "multiplicity", "activity")
+            field.name: getattr(self, field.name).to(device)
+            for field in dataclasses.fields(self)
+            if field.name not in ("n_trajectories", "data_hash")
         }
         return dataclasses.replace(self, **moved)
 
-    def batch(self, windows: Tensor, offsets: Tensor | None = None) -> Batch:
+    def batch(
+        self, windows: Tensor, variation: Variation | None = None, shared: bool = False
+    ) -> Batch:
         """The named tensors of some windows, as `Policy` says.
 
         Args:
             windows: which windows, int64 `(B,)`.
-            offsets: where each window's images are cut, see `Frames.gather`.
+            variation: how they are varied; not at all if left out.
+            shared: give each picture once: `pictures/<camera>` instead of `images/<camera>`.
         """
         at = self.history[windows]
-        images = self.frames.gather(at, offsets)
-        return {
-            **{f"images/{camera}": image for camera, image in images.items()},
+        runs = torch.zeros_like(windows) if variation is None else variation.runs
+        steps = (runs[:, None] * len(self.gripper) + at).flatten()
+        where = None
+        if shared:
+            steps, where = steps.unique(return_inverse=True)
+        of, steps = steps // len(self.gripper), steps % len(self.gripper)
+        offsets = None
+        if variation is not None:
+            # A run's windows are varied alike: any of them tells how.
+            different, first = _first_of_each(runs)
+            offsets = variation.offsets[first][torch.searchsorted(different, of)]
+        batch = {
             "gripper": self.gripper[at],
+            "up": self.up[at[:, -1]],
             "action": self.actions[windows],
         }
+        if where is not None:
+            batch["pictures"] = where.view_as(at)
+        for camera, pictures in self.frames.gather(steps, offsets).items():
+            if where is None:
+                batch[f"images/{camera}"] = pictures.unflatten(0, at.shape)
+            else:
+                batch[f"pictures/{camera}"] = pictures
+        return batch
 
     def will_need(self, windows: Tensor) -> None:
         """Say which windows come next, so that the disk has read them by then."""
         self.frames.will_need(self.history[windows])
 
     def epoch_order(
-        self, rng: np.random.Generator, weighting: str = "balanced"
-    ) -> NDArray[np.int64]:
-        """One epoch's windows in random order: as many as all trajectories have together.
+        self, rng: np.random.Generator, weighting: str = "balanced", run: int = 1
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """One epoch's windows, as many as all trajectories have together, and each one's run.
 
         Args:
             rng: decides the order, and which of windows that weigh alike come once more.
             weighting: "trajectories" draws each as often as its multiplicity, so that most of what
                 is learned from is what trajectories share. "balanced" draws each in proportion to
                 the root of its multiplicity, times its activity.
+            run: so many windows that follow each other stay together, at random places in the
+                order; they have most of their images in common.
         """
         multiplicity = self.multiplicity.cpu().numpy()
         weights = multiplicity.astype(np.float64)
@@ -164,7 +212,11 @@ class Windows:
         ends = np.cumsum(weights) * (multiplicity.sum() / weights.sum())
         ends[-1] = multiplicity.sum()
         counts = np.diff(np.floor(ends + rng.random()), prepend=0).astype(np.int64)
-        return rng.permutation(np.repeat(np.arange(len(counts)), counts))
+        windows = np.repeat(np.arange(len(counts)), counts)
+        runs = (np.arange(len(windows)) + rng.integers(run)) // run
+        runs = rng.permutation(runs[-1] + 1)[runs]
+        order = np.argsort(runs, kind="stable")
+        return windows[order], runs[order]
 
     def normalisation(self) -> Normalisation:
         """Means and scales over all trajectories.
@@ -178,6 +230,7 @@ class Windows:
         # Of a chunk, the first action: the others are other windows' first.
         actions = self.actions.reshape(len(weights), -1, self.actions.shape[-1])[:, 0]
         action_mean, action_std = _weighted_moments(actions.cpu().numpy(), weights)
+        up_mean, _ = _weighted_moments(self.up[self.history[:, -1]].cpu().numpy(), weights)
         for kind, floor in (
             (slice(0, 3), _TRANSLATION_FLOOR),
             (slice(3, 6), _ROTATION_FLOOR),
@@ -186,7 +239,7 @@ class Windows:
             std = action_std[kind]
             action_std[kind] = np.maximum(std, max(floor, _RELATIVE_FLOOR * std.max()))
         gripper_std = np.maximum(gripper_std, _GRIPPER_FLOOR)
-        return Normalisation(gripper_mean, gripper_std, action_mean, action_std)
+        return Normalisation(gripper_mean, gripper_std, up_mean, action_mean, action_std)
 
 
 def open_windows(
@@ -197,9 +250,9 @@ def open_windows(
 ) -> Windows:
     """The windows of a dataset, on the CPU, their images in a file that is mapped into memory.
 
-    Only images, measured gripper and actions enter. A window that would begin before its
-    trajectory does repeats the trajectory's first step; a chunk that would end after it repeats
-    the last action, which holds still.
+    Only images, measured gripper, how the tool is tilted, and actions enter. A window that would
+    begin before its trajectory does repeats the trajectory's first step; a chunk that would end
+    after it repeats the last action, which holds still.
 
     The files in `directory` are written once, episode by episode, and used again for the same
     dataset and `config`.
@@ -217,7 +270,8 @@ def open_windows(
         CannotWrite: the disk refuses, or has too little room.
     """
     layout = _layout(dataset, config)
-    key = digest({"dataset": dataset.content_hash, **dataclasses.asdict(config)})
+    options = dataclasses.asdict(config)
+    key = digest({"dataset": dataset.content_hash, "layout": _LAYOUT, **options})
     frames, samples = Path(directory) / FRAMES, Path(directory) / SAMPLES
     try:
         tensors, about = load_tensors(samples)
@@ -280,7 +334,7 @@ def _write(
     check_room(path, n_steps * layout.frame_bytes)
 
     back, ahead = np.arange(-config.history + 1, 1), np.arange(config.chunk)
-    gripper = np.empty(n_steps)
+    gripper, up = np.empty(n_steps), np.empty((n_steps, 3))
     histories: list[NDArray[np.int64]] = []
     chunks: list[NDArray[np.float32]] = []
     change = 0.0
@@ -294,6 +348,7 @@ def _write(
             file.write(packed.data)
             sha.update(packed.data)
             gripper[n_written : n_written + len(steps)] = steps.measured_gripper
+            up[n_written : n_written + len(steps)] = up_in_tool(steps.measured_Ts_world_tool)
             sequence = np.concatenate([np.arange(n_written, n_written + len(steps)), following])
             histories.append(sequence[_clipped(len(sequence), back)])
             chunks.append(actions.astype(np.float32)[_clipped(len(sequence), ahead)])
@@ -320,6 +375,7 @@ def _write(
     chunk = np.concatenate(chunks)[chosen]
     arrays = {
         "gripper": gripper[:n_written].astype(np.float32),
+        "up": up[:n_written].astype(np.float32),
         "history": windows,
         "actions": chunk[:, 0] if config.chunk == 1 else chunk,
         "multiplicity": multiplicity,
@@ -330,6 +386,14 @@ def _write(
         "data_hash": digest({"frames": sha.hexdigest(), **arrays}),
     }
     return {name: torch.from_numpy(array) for name, array in arrays.items()}, about
+
+
+def _first_of_each(runs: Tensor) -> tuple[Tensor, Tensor]:
+    """The different ones, sorted, and where each comes first."""
+    different, inverse = runs.unique(return_inverse=True)
+    first = torch.full_like(different, len(runs))
+    at = torch.arange(len(runs), device=runs.device)
+    return different, first.scatter_reduce(0, inverse, at, "amin")
 
 
 def _trajectories(

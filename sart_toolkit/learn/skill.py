@@ -202,7 +202,7 @@ class Skill:
         self._gripper.clear()
         self._chunk.clear()
 
-    def act(self, images: Mapping[str, Image], gripper: float) -> Array:
+    def act(self, images: Mapping[str, Image], gripper: float, up: Array) -> Array:
         """The action `(7,)`: xyz [m], rotation vector [rad], tool frame; gripper target in [0, 1].
 
         Where the policy predicts several actions at once, they are given one after the other
@@ -213,19 +213,23 @@ class Skill:
             images: what the skill's `cameras` see now, by name, uint8 `(H, W, 3)` of any size;
                 resized exactly as in training. Other cameras' are left aside.
             gripper: measured gripper in [0, 1] (0 open).
+            up: the world's upward direction `(3,)` in the tool frame, as `Observation.up` has it.
 
         Raises:
             InvalidInput: a camera's image is missing or isn't one, the gripper is not a finite
-                number, or the policy predicts no action.
+                number, `up` is no direction, or the policy predicts no action.
         """
         seen = {name: _checked_image(name, images) for name in self.cameras}
         if not np.isfinite(gripper):
             raise InvalidInput(f"gripper: expected a number in [0, 1], got {gripper}")
+        up = check_array("up", up, (3,))
+        if not np.isclose(np.linalg.norm(up), 1.0, atol=1e-3):
+            raise InvalidInput(f"up: expected a unit vector in the tool frame, got {up}")
         for name, size in self.config.image_sizes.items():
             _remember(self._images[name], resize_area(seen[name], size))
         _remember(self._gripper, float(gripper))
         if not self._chunk:
-            self._chunk.extend(self._predict())
+            self._chunk.extend(self._predict(up))
         action = self._chunk.popleft()
         action[6] = self._commandable(action[6])
         return action
@@ -234,20 +238,23 @@ class Skill:
         """The action `(7,)` for an observation of `sart_toolkit.gym`, see `act`.
 
         Args:
-            observation: `pixels`, images by camera, and `agent_pos`, the gripper first.
+            observation: `pixels`, images by camera, and `agent_pos`: the gripper, its rate, and
+                the upward direction.
 
         Raises:
             InvalidInput: as `act`.
         """
-        return self.act(observation["pixels"], float(observation["agent_pos"][0]))
+        state = np.asarray(observation["agent_pos"], np.float64)
+        return self.act(observation["pixels"], float(state[0]), state[2:])
 
-    def _predict(self) -> Array:
+    def _predict(self, up: Array) -> Array:
         """The next actions `(k, 7)`."""
         observation = {
             f"images/{name}": torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
             for name, images in self._images.items()
         }
         observation["gripper"] = torch.tensor(list(self._gripper))
+        observation["up"] = torch.from_numpy(up.astype(np.float32))
         with torch.inference_mode(), torch_threads(_THREADS):
             predicted = self._policy.predict(
                 {name: value[None].to(self._device) for name, value in observation.items()}

@@ -29,7 +29,13 @@ from sart_toolkit.data.storage import (
 from sart_toolkit.errors import InvalidInput, Mismatch, SartError, unknown_name
 from sart_toolkit.learn.policies import POLICIES, get_policy
 from sart_toolkit.learn.policy import Policy, PolicySetup
-from sart_toolkit.learn.samples import WEIGHTINGS, WindowConfig, Windows, open_windows
+from sart_toolkit.learn.samples import (
+    WEIGHTINGS,
+    Variation,
+    WindowConfig,
+    Windows,
+    open_windows,
+)
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.poses import check_positive
 from sart_toolkit.registry import lasting_reference
@@ -38,6 +44,9 @@ from sart_toolkit.userfiles import local_file
 CHECKPOINT = "checkpoint.safetensors"
 _CHECKPOINT_SECONDS = 30.0
 _WARM_UP = 0.05
+# So many windows that follow each other are learned from together where a policy encodes each
+# picture of a batch once: 5 pictures then do for what else takes 8.
+_TOGETHER = 4
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, str], None]
@@ -243,6 +252,34 @@ def learning_rate(config: TrainConfig, step: int, n_steps: int) -> float:
     return config.lr * 0.5 * (1.0 + math.cos(math.pi * (step - warm_up) / (n_steps - warm_up)))
 
 
+def epoch_batches(
+    windows: Windows, config: TrainConfig, epoch: int, n_batches: int
+) -> list[tuple[Tensor, Variation]]:
+    """The windows of each batch of an epoch, and how they are varied.
+
+    Args:
+        windows: all of them.
+        config: how is trained.
+        epoch: counted from 0.
+        n_batches: how many; they differ by at most one window.
+    """
+    rng = np.random.default_rng([config.seed, epoch])
+    together = _TOGETHER if get_policy(config.policy).shares_pictures else 1
+    order, runs = windows.epoch_order(rng, config.weighting, together)
+    n = int(runs.max()) + 1
+    offsets = rng.integers(0, 2 * config.image_shift + 1, (n, 2))
+    return [
+        (
+            torch.from_numpy(some).to(windows.device),
+            Variation(*map(torch.from_numpy, (offsets[of], of))).to(windows.device),
+        )
+        # Of nearly equal size: a small last batch would disturb BatchNorm.
+        for some, of in zip(
+            np.array_split(order, n_batches), np.array_split(runs, n_batches), strict=True
+        )
+    ]
+
+
 def make_optimizer(policy: Policy, config: TrainConfig) -> torch.optim.AdamW:
     """AdamW over all of a policy's weights, its update fused into one pass."""
     return torch.optim.AdamW(
@@ -349,7 +386,7 @@ class _Training:
         saved = time.perf_counter()
         for epoch in range(len(self.curve), config.epochs):
             began = time.perf_counter() - self.seconds
-            batches = self._epoch_batches(epoch)
+            batches = epoch_batches(self.windows, config, epoch, self.n_batches)
             for batch in range(self.batch, self.n_batches):
                 step = epoch * self.n_batches + batch
                 for group in self.optimizer.param_groups:
@@ -374,23 +411,9 @@ class _Training:
         self._save()
         return self._result()
 
-    def _epoch_batches(self, epoch: int) -> list[tuple[Tensor, Tensor]]:
-        rng = np.random.default_rng([self.config.seed, epoch])
-        order = self.windows.epoch_order(rng, self.config.weighting)
-        offsets = rng.integers(0, 2 * self.config.image_shift + 1, (len(order), 2))
-        device = self.windows.device
-        # Batches that differ by at most one window: a small last batch would disturb BatchNorm.
-        return [
-            (torch.from_numpy(a).to(device), torch.from_numpy(b).to(device))
-            for a, b in zip(
-                np.array_split(order, self.n_batches),
-                np.array_split(offsets, self.n_batches),
-                strict=True,
-            )
-        ]
-
-    def _step(self, windows: Tensor, offsets: Tensor) -> None:
-        batch = {k: v.to(self.device) for k, v in self.windows.batch(windows, offsets).items()}
+    def _step(self, windows: Tensor, variation: Variation) -> None:
+        batch = self.windows.batch(windows, variation, self.policy.shares_pictures)
+        batch = {k: v.to(self.device) for k, v in batch.items()}
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             loss = self.policy.loss(batch)
         self.optimizer.zero_grad(set_to_none=True)

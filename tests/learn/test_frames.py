@@ -49,24 +49,24 @@ def test_gathering_gives_what_the_file_holds_however_often_it_is_let_go(file, at
     monkeypatch.setattr(frames, "_MAPPED_AT_MOST", at_most)
     path, layout, held = file
     found = Frames.in_file(path, layout)
-    at = torch.tensor([[3, 4], [49, 0], [7, 7]])
+    at = torch.tensor([3, 4, 49, 0, 7, 7])
     for _ in range(3):
         found.will_need(at)
         middle = found.gather(at)
-        corner = found.gather(at, torch.tensor([[0, 2]] * 3))
+        corner = found.gather(at, torch.tensor([[0, 2]] * 6))
         for camera in ("a", "b"):
             expected = held[camera][at.numpy()]
-            assert (middle[camera].permute(0, 1, 3, 4, 2).numpy()
-                    == expected[:, :, 1:-1, 1:-1]).all()  # fmt: skip
-            assert (corner[camera].permute(0, 1, 3, 4, 2).numpy()
-                    == expected[:, :, :-2, 2:]).all()  # fmt: skip
+            assert (middle[camera].permute(0, 2, 3, 1).numpy()
+                    == expected[:, 1:-1, 1:-1]).all()  # fmt: skip
+            assert (corner[camera].permute(0, 2, 3, 1).numpy()
+                    == expected[:, :-2, 2:]).all()  # fmt: skip
 
 
 def test_a_copy_in_memory_gathers_the_same(file):
     path, layout, _ = file
     mapped = Frames.in_file(path, layout)
     copied = mapped.to(torch.device("cpu"))
-    at = torch.tensor([[3, 4], [49, 0]])
+    at = torch.tensor([3, 4, 49, 0])
     copied.will_need(at)
     for camera, images in copied.gather(at).items():
         assert torch.equal(images, mapped.gather(at)[camera])

@@ -59,6 +59,8 @@ def test_group_norm_has_the_same_names_without_running_statistics():
     assert found == {name for name in _torchvision_resnet18() if not name.endswith(gone)}
 
 
+# The tool points down.
+UP = (0.0, 0.0, -1.0)
 LEARNED = sorted(set(POLICIES) - {"replay"})
 
 
@@ -79,21 +81,21 @@ def _observation(n, **sizes):
         f"images/{camera}": torch.randint(0, 256, (n, 2, 3, *size), dtype=torch.uint8)
         for camera, size in sizes.items()
     }
-    return _Recorded({**images, "gripper": torch.rand(n, 2)})
+    return _Recorded({**images, "gripper": torch.rand(n, 2), "up": torch.rand(n, 3)})
 
 
 @pytest.mark.parametrize("policy", LEARNED)
-def test_a_policy_takes_images_and_gripper_and_nothing_else(policy):
+def test_a_policy_takes_images_gripper_and_tilt_and_nothing_else(policy):
     sizes = {"wrist": (32, 32), "overview": (32, 48)}
     config = TrainConfig.for_policy(policy, cameras=tuple(sizes), hidden=8)
     model = build_policy(config, sizes).eval()
     observation = _observation(2, **sizes)
     observation["joint_positions"] = torch.rand(2, 6)
     model.predict(observation)
-    assert observation.asked == {"images/wrist", "images/overview", "gripper"}
+    assert observation.asked == {"images/wrist", "images/overview", "gripper", "up"}
     observation["action"] = torch.rand(2, 7)
     model.loss(observation)
-    assert observation.asked == {"images/wrist", "images/overview", "gripper", "action"}
+    assert observation.asked == {"images/wrist", "images/overview", "gripper", "up", "action"}
 
 
 @pytest.mark.parametrize(("policy", "norm"), [(p, n) for p in LEARNED for n in get_policy(p).norms])
@@ -250,7 +252,7 @@ def test_replay_gives_the_demonstrations_actions_whatever_is_seen_and_then_holds
         skill.reset()
         for t in range(len(demonstration) + 3):
             image = rng.integers(0, 256, (32, 32, 3), dtype=np.uint8)
-            action = skill.act({"wrist": image}, rng.uniform())
+            action = skill.act({"wrist": image}, rng.uniform(), UP)
             if t < len(demonstration):
                 np.testing.assert_allclose(action, demonstration.actions[t], atol=1e-6)
             else:

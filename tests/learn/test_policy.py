@@ -14,6 +14,8 @@ from sart_toolkit.learn.skill import load_skill, save_skill
 from sart_toolkit.learn.training import TrainConfig, build_policy, train
 
 _CHUNK = 3
+# The tool points down.
+UP = (0.0, 0.0, -1.0)
 
 
 class Linear(Policy):
@@ -54,12 +56,13 @@ def test_a_policy_of_ones_own_is_trained_saved_loaded_and_run(dataset, config, t
     skill = load_skill(tmp_path)
     steps = dataset.sources[0].demonstration.steps
     image = steps.cameras["wrist"].rgb[0]
-    actions = [skill.act({"wrist": image}, 0.5)[:6] for _ in range(_CHUNK)]
+    actions = [skill.act({"wrist": image}, 0.5, UP)[:6] for _ in range(_CHUNK)]
     observation = {
         "images/wrist": torch.from_numpy(
             image.reshape(16, 2, 16, 2, 3).mean((1, 3)).round().astype(np.uint8)
         ).permute(2, 0, 1)[None, None],
         "gripper": torch.tensor([[0.5]]),
+        "up": torch.tensor([UP]),
     }
     with torch.inference_mode():
         expected = result.policy.predict(observation)[0, :, :6]

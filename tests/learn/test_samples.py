@@ -14,6 +14,7 @@ from sart_toolkit.learn.samples import (
     FRAMES,
     SAMPLES,
     WEIGHTINGS,
+    Variation,
     WindowConfig,
     open_windows,
     remove_windows,
@@ -40,6 +41,10 @@ def _expected_windows(dataset, history):
                 tuple(action.astype(np.float32)),
             ] += 1
     return windows
+
+
+def _varied(offsets, runs=None):
+    return Variation(offsets, torch.arange(len(offsets)) if runs is None else runs)
 
 
 @pytest.mark.parametrize("history", [1, 2, 3])
@@ -87,7 +92,7 @@ def test_the_shared_suffix_counts_once_for_every_trajectory(dataset, open_window
 
 def test_an_epoch_passes_every_step_of_every_trajectory_once(dataset, open_windows):
     windows = open_windows(dataset)
-    order = windows.epoch_order(np.random.default_rng(0), "trajectories")
+    order, _ = windows.epoch_order(np.random.default_rng(0), "trajectories")
     assert (np.bincount(order) == windows.multiplicity.numpy()).all()
     assert len(order) == 9 + (4 + 6) + 2 * (4 + 4)
 
@@ -95,9 +100,29 @@ def test_an_epoch_passes_every_step_of_every_trajectory_once(dataset, open_windo
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
 def test_an_epoch_s_order_is_decided_by_its_random_numbers(dataset, open_windows, weighting):
     windows = open_windows(dataset)
-    order = windows.epoch_order(np.random.default_rng(0), weighting)
-    assert (order != windows.epoch_order(np.random.default_rng(1), weighting)).any()
-    assert (order == windows.epoch_order(np.random.default_rng(0), weighting)).all()
+    order, runs = windows.epoch_order(np.random.default_rng(0), weighting, 3)
+    assert (order != windows.epoch_order(np.random.default_rng(1), weighting, 3)[0]).any()
+    again, runs_again = windows.epoch_order(np.random.default_rng(0), weighting, 3)
+    assert (order == again).all() and (runs == runs_again).all()
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+def test_windows_of_a_run_follow_each_other_and_runs_come_in_any_order(
+    dataset, open_windows, weighting
+):
+    windows = open_windows(dataset)
+    rng, starts = np.random.default_rng(0), set()
+    for _ in range(20):
+        order, runs = windows.epoch_order(rng, weighting, 4)
+        alone, _ = windows.epoch_order(np.random.default_rng(0), weighting)
+        assert np.abs(np.bincount(order, minlength=len(windows.history))
+                      - np.bincount(alone, minlength=len(windows.history))).max() <= 1  # fmt: skip
+        assert (np.diff(runs) >= 0).all() and (np.bincount(runs) <= 4).all()
+        for run in np.unique(runs):
+            of = order[runs == run]
+            assert (np.diff(of) >= 0).all()
+        starts.add(int(order[0]))
+    assert len(starts) > 5
 
 
 def test_a_balanced_epoch_draws_by_the_root_of_multiplicity_and_by_activity(dataset, open_windows):
@@ -108,7 +133,7 @@ def test_a_balanced_epoch_draws_by_the_root_of_multiplicity_and_by_activity(data
     expected = n * weights / weights.sum()
     total = np.zeros(len(expected))
     for seed in range(200):
-        order = windows.epoch_order(np.random.default_rng(seed), "balanced")
+        order, _ = windows.epoch_order(np.random.default_rng(seed), "balanced")
         counts = np.bincount(order, minlength=len(expected))
         assert len(order) == n and (np.abs(counts - expected) < 1).all()
         total += counts
@@ -192,7 +217,7 @@ def test_shifts_move_all_of_a_windows_images_alike_and_repeat_the_edge(dataset, 
     chosen = torch.tensor([4, 7, 2])
     plain = open_windows(dataset).batch(chosen)
     offsets = torch.tensor([[0, 0], [3, 3], [5, 1]])
-    shifted = padded.batch(chosen, offsets)
+    shifted = padded.batch(chosen, _varied(offsets))
     for image, result, (row, column) in zip(
         plain["images/wrist"], shifted["images/wrist"], offsets.tolist(), strict=True
     ):
@@ -204,13 +229,14 @@ def test_shifts_move_all_of_a_windows_images_alike_and_repeat_the_edge(dataset, 
     assert torch.equal(padded.batch(chosen)["images/wrist"], plain["images/wrist"])
 
 
-def test_a_batch_is_images_gripper_and_action_and_nothing_else(two_cameras, open_windows):
+def test_a_batch_is_images_gripper_tilt_and_action_and_nothing_else(two_cameras, open_windows):
     windows = open_windows(two_cameras, cameras=("wrist", "overview"))
     batch = windows.batch(torch.arange(4))
     assert {name: (tuple(v.shape), v.dtype) for name, v in batch.items()} == {
         "images/wrist": ((4, 2, 3, 16, 16), torch.uint8),
         "images/overview": ((4, 2, 3, 16, 24), torch.uint8),
         "gripper": ((4, 2), torch.float32),
+        "up": ((4, 3), torch.float32),
         "action": ((4, 7), torch.float32),
     }
 
@@ -225,14 +251,31 @@ def test_each_cameras_images_are_those_it_has_alone(two_cameras, open_windows, s
     for camera in ("wrist", "overview"):
         alone = open_windows(two_cameras, cameras=(camera,), image_shift=shift)
         name = f"images/{camera}"
-        expected = alone.batch(chosen, offsets)[name]
-        assert torch.equal(both.batch(chosen, offsets)[name], expected)
+        expected = alone.batch(chosen, _varied(offsets))[name]
+        assert torch.equal(both.batch(chosen, _varied(offsets))[name], expected)
+
+
+def test_a_shared_batch_has_each_picture_of_a_run_once(two_cameras, open_windows):
+    windows = open_windows(two_cameras, cameras=("wrist", "overview"), image_shift=2)
+    chosen = torch.tensor([0, 1, 2, 2, 9, 10, 11, 1])
+    runs = torch.tensor([5, 5, 5, 5, 0, 0, 0, 7])
+    offsets = torch.tensor([[0, 1]] * 4 + [[4, 2]] * 3 + [[3, 3]])
+    apart = windows.batch(chosen, _varied(offsets, runs=runs))
+    shared = windows.batch(chosen, _varied(offsets, runs=runs), shared=True)
+    assert torch.equal(apart["gripper"], shared["gripper"])
+    assert torch.equal(apart["action"], shared["action"])
+    for camera in ("wrist", "overview"):
+        pictures = shared[f"pictures/{camera}"]
+        assert torch.equal(pictures[shared["pictures"]], apart[f"images/{camera}"])
+        different = {(int(r), int(f)) for r, h in zip(runs, windows.history[chosen], strict=True)
+                     for f in h}  # fmt: skip
+        assert len(pictures) == len(different) < apart[f"images/{camera}"].flatten(0, 1).shape[0]
 
 
 @pytest.mark.parametrize("shift", [0, 2])
 def test_batches_are_channels_last(two_cameras, open_windows, shift):
     windows = open_windows(two_cameras, cameras=("wrist", "overview"), image_shift=shift)
-    batch = windows.batch(torch.arange(4), torch.full((4, 2), shift))
+    batch = windows.batch(torch.arange(4), _varied(torch.full((4, 2), shift)))
     for camera in ("wrist", "overview"):
         images = batch[f"images/{camera}"].flatten(0, 1)
         assert images.is_contiguous(memory_format=torch.channels_last)

@@ -16,6 +16,10 @@ from sart_toolkit.learn.skill import Skill, SkillConfig, load_skill, save_skill
 from sart_toolkit.learn.skillfiles import write_config
 from sart_toolkit.learn.tensorfile import load_tensors, save_tensors
 from sart_toolkit.learn.training import CHECKPOINT, train
+from sart_toolkit.poses import up_in_tool
+
+# The tool points down.
+UP = (0.0, 0.0, -1.0)
 
 
 @pytest.fixture
@@ -84,7 +88,11 @@ def test_a_skill_acts_as_the_policy_did_in_training(
             at = windows.history.tolist().index([max(0, t - 1), t])
             with torch.inference_mode():
                 expected = result.policy.predict(windows.batch(torch.tensor([at])))[0].numpy()
-            action = skill.act(_images(steps, t), float(steps.measured_gripper[t]))
+            action = skill.act(
+                _images(steps, t),
+                float(steps.measured_gripper[t]),
+                up_in_tool(steps.measured_Ts_world_tool[t]),
+            )
             assert action.shape == (7,) and action.dtype == np.float64
             assert np.allclose(action[:6], expected[:6], atol=1e-7)
             # Shown only open or closed, so commanded so.
@@ -101,7 +109,7 @@ def test_the_gripper_is_commanded_as_was_shown_unless_that_was_much(trained, dat
     other = dataclasses.replace(demonstration, steps=steps)
     skill = Skill(skill._policy, skill.config, other, skill.annotation, skill.training)
     commanded = {
-        skill.act({"wrist": rgb}, gripper)[6]
+        skill.act({"wrist": rgb}, gripper, UP)[6]
         for rgb, gripper in zip(
             demonstration.steps.cameras["wrist"].rgb, np.linspace(0, 1, len(steps)), strict=True
         )
@@ -135,13 +143,14 @@ def spied(trained):
     return Skill(spy, skill.config, skill.demonstration, skill.annotation, skill.training), spy
 
 
-def test_a_policy_sees_images_and_gripper_and_nothing_else(spied):
+def test_a_policy_sees_images_gripper_and_tilt_and_nothing_else(spied):
     skill, spy = spied
-    skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.25)
+    skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.25, UP)
     (seen,) = spy.seen
     assert {name: tuple(tensor.shape) for name, tensor in seen.items()} == {
         "images/wrist": (1, 2, 3, 16, 16),
         "gripper": (1, 2),
+        "up": (1, 3),
     }
     assert seen["gripper"].tolist() == [[0.25, 0.25]]
 
@@ -160,7 +169,7 @@ def test_a_policy_acts_with_one_thread_and_leaves_torch_s_alone(spied, monkeypat
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.25)
+        skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.25, UP)
         assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
@@ -171,7 +180,7 @@ def test_a_chunk_is_executed_before_the_policy_is_asked_again(spied):
     skill, spy = spied
     for step in range(4):
         image = np.full((32, 32, 3), step, np.uint8)
-        action = skill.act({"wrist": image}, step / 10)
+        action = skill.act({"wrist": image}, step / 10, UP)
         assert action[:6].tolist() == [7.0 * (step % 3) + i for i in range(6)]
     assert len(spy.seen) == 2
     # What was seen meanwhile is part of the history.
@@ -182,9 +191,9 @@ def test_a_chunk_is_executed_before_the_policy_is_asked_again(spied):
 def test_a_reset_ends_the_chunk_and_reaches_the_policy(spied):
     skill, spy = spied
     image = np.zeros((32, 32, 3), np.uint8)
-    skill.act({"wrist": image}, 0.0)
+    skill.act({"wrist": image}, 0.0, UP)
     skill.reset()
-    skill.act({"wrist": image}, 1.0)
+    skill.act({"wrist": image}, 1.0, UP)
     assert len(spy.seen) == 2 and spy.n_resets == 1
     assert spy.seen[1]["gripper"].tolist() == [[1.0, 1.0]]
 
@@ -202,15 +211,15 @@ def test_a_policy_that_predicts_no_actions_is_refused(spied, predicted, message)
     skill, spy = spied
     spy.predicted = predicted
     with pytest.raises(InvalidInput, match=message):
-        skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.0)
+        skill.act({"wrist": np.zeros((32, 32, 3), np.uint8)}, 0.0, UP)
 
 
 def test_a_skill_takes_images_of_any_size(trained):
     skill = load_skill(trained[0])
     rgb = np.full((32, 32, 3), 90, np.uint8)
-    first = skill.act({"wrist": rgb}, 0.5)
+    first = skill.act({"wrist": rgb}, 0.5, UP)
     skill.reset()
-    assert np.allclose(skill.act({"wrist": np.full((48, 20, 3), 90, np.uint8)}, 0.5), first)
+    assert np.allclose(skill.act({"wrist": np.full((48, 20, 3), 90, np.uint8)}, 0.5, UP), first)
 
 
 def test_a_skill_says_where_it_came_from(trained, dataset):
@@ -236,17 +245,19 @@ def test_a_skill_says_where_it_came_from(trained, dataset):
 )
 def test_anything_but_an_image_is_refused(trained, rgb):
     with pytest.raises(InvalidInput, match=r"image of camera 'wrist': expected uint8 of shape \("):
-        load_skill(trained[0]).act({"wrist": rgb}, 0.0)
+        load_skill(trained[0]).act({"wrist": rgb}, 0.0, UP)
 
 
 def test_a_missing_cameras_image_is_refused(trained):
     with pytest.raises(InvalidInput, match="expected one of camera 'wrist', got overview"):
-        load_skill(trained[0]).act({"overview": np.zeros((8, 8, 3), np.uint8)}, 0.0)
+        load_skill(trained[0]).act({"overview": np.zeros((8, 8, 3), np.uint8)}, 0.0, UP)
 
 
 def test_a_gripper_that_is_not_a_number_is_refused(trained):
     with pytest.raises(InvalidInput, match=r"gripper: expected a number in \[0, 1\], got nan"):
-        load_skill(trained[0]).act({"wrist": np.zeros((8, 8, 3), np.uint8)}, float("nan"))
+        load_skill(trained[0]).act({"wrist": np.zeros((8, 8, 3), np.uint8)}, float("nan"), UP)
+    with pytest.raises(InvalidInput, match="up: expected a unit vector in the tool frame"):
+        load_skill(trained[0]).act({"wrist": np.zeros((8, 8, 3), np.uint8)}, 0.0, (0.0, 0.0, 0.0))
 
 
 def test_a_skill_is_not_overwritten_unless_asked(trained, dataset):

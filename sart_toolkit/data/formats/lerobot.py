@@ -1,7 +1,8 @@
 """LeRobot dataset v3.0: parquet tables, MP4 videos and JSON, without importing lerobot.
 
 A policy of LeRobot takes `observation.state` and the images. As in SART's own policies, the state
-is the gripper alone; joints and poses are there under names that such a policy leaves aside.
+is the gripper and how the tool is tilted; joints and poses are there under names that such a policy
+leaves aside.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from sart_toolkit.data.formats.statistics import LevelStatistics, RowStatistics
 from sart_toolkit.data.formats.video import Codec, VideoWriter, best_codec, required
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.poses import Array
+from sart_toolkit.poses import Array, up_in_tool
 
 VERSION = "v3.0"
 INFO, STATS, TASKS, SIDE = (
@@ -128,7 +129,9 @@ def rows_of(trajectory: Trajectory, hz: int, with_force: bool) -> dict[str, NDAr
     rate = np.diff(gripper, prepend=gripper[:1]) * hz
     features = {
         "action": trajectory.actions,
-        "observation.state": np.stack([gripper, rate], axis=1),
+        "observation.state": np.column_stack(
+            [gripper, rate, up_in_tool(steps.measured_Ts_world_tool)]
+        ),
         "observation.joint_positions": steps.joint_positions,
         "observation.joint_velocities": steps.joint_velocities,
         "observation.tool_pose": pose_rows(steps.measured_Ts_world_tool),
@@ -149,8 +152,11 @@ def _describe_features(
     told: dict[str, tuple[list[str], dict[str, str]]] = {
         "action": (list(ACTION_NAMES), {"convention": CONVENTIONS["action"], "frame": "tool"}),
         "observation.state": (
-            ["gripper", "gripper_rate"],
-            {"convention": f"measured gripper, {CONVENTIONS['gripper']}, and its rate [1/s]"},
+            ["gripper", "gripper_rate", "up_x", "up_y", "up_z"],
+            {
+                "convention": f"measured gripper, {CONVENTIONS['gripper']}, its rate [1/s], and "
+                "the world's upward direction in the tool frame"
+            },
         ),
         "observation.joint_positions": (joints, {"unit": "rad"}),
         "observation.joint_velocities": (joints, {"unit": "rad/s"}),

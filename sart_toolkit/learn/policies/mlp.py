@@ -13,18 +13,22 @@ from sart_toolkit.learn.policies.encoder import Encoder
 from sart_toolkit.learn.policy import Policy, PolicySetup
 
 STATE_FEATURE = 512
+# The tilt that counts as one [rad].
+_TILT = 0.1
 
 
 class MLPPolicy(Policy):
     """One action from an encoder for each camera, under one multi-layer perceptron.
 
-    The features of every image and a 512-d feature of the gripper history pass two hidden ReLU
-    layers (the paper's table). Cameras share the encoder's class, not its weights.
+    The features of every image and a 512-d feature of the gripper history and the tool's tilt pass
+    two hidden ReLU layers (the paper's table, which has no tilt). Cameras share the encoder's
+    class, not its weights.
 
     A subclass names its `encoder`. The loss is the mean squared error of the normalised actions.
     """
 
     encoder: ClassVar[type[Encoder]]
+    shares_pictures: ClassVar[bool] = True
     image_mean: Tensor
     image_scale: Tensor
 
@@ -33,7 +37,7 @@ class MLPPolicy(Policy):
         encoders = [self.encoder(size, setup.norm) for size in setup.cameras.values()]
         self.encoders = nn.ModuleList(encoders)
         n_features = sum(encoder.feature_size for encoder in encoders)
-        self.gripper_layer = nn.Sequential(nn.Linear(setup.history, STATE_FEATURE), nn.ReLU())
+        self.state_layer = nn.Sequential(nn.Linear(setup.history + 3, STATE_FEATURE), nn.ReLU())
         self.head = nn.Sequential(
             nn.Linear(setup.history * n_features + STATE_FEATURE, setup.hidden),
             nn.ReLU(),
@@ -54,12 +58,20 @@ class MLPPolicy(Policy):
     def _normalised_actions(self, observation: Mapping[str, Tensor]) -> Tensor:
         gripper = observation["gripper"]
         features = []
+        # In training, windows that follow each other have images in common: each is encoded once.
+        where = observation.get("pictures")
         for camera, encoder in zip(self.setup.cameras, self.encoders, strict=True):
-            images = observation[f"images/{camera}"].flatten(0, 1).float()
-            features.append(encoder((images - self.image_mean) * self.image_scale))
+            if where is None:
+                images = observation[f"images/{camera}"].flatten(0, 1)
+            else:
+                images = observation[f"pictures/{camera}"]
+            feature = encoder((images.float() - self.image_mean) * self.image_scale)
+            features.append(feature if where is None else feature[where])
         # The head costs a tenth of the encoder; in bfloat16, coordinates would lose an eighth of
         # a pixel.
         with torch.autocast(gripper.device.type, enabled=False):
-            state = self.gripper_layer((gripper - self.gripper_mean) / self.gripper_std)
+            opening = (gripper - self.gripper_mean) / self.gripper_std
+            tilt = (observation["up"] - self.up_mean) / _TILT
+            state = self.state_layer(torch.cat([opening, tilt], 1))
             seen = [feature.float().reshape(len(gripper), -1) for feature in features]
             return self.head(torch.cat([*seen, state], 1))

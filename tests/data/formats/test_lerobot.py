@@ -67,6 +67,8 @@ def test_the_tables_say_what_the_trajectories_do(exported, trajectories):
         np.testing.assert_allclose(actions, trajectory.actions, atol=1e-7)
         state = np.array(part["observation.state"].to_pylist())
         np.testing.assert_allclose(state[:, 0], trajectory.steps.measured_gripper, atol=1e-7)
+        R = trajectory.steps.measured_Ts_world_tool[:, :3, :3]
+        np.testing.assert_allclose(state[:, 2:], R.swapaxes(1, 2) @ [0, 0, 1], atol=1e-7)
         timestamps = np.array(part["timestamp"].to_pylist())
         np.testing.assert_allclose(timestamps, np.arange(len(trajectory)) / 10, atol=1e-6)
         assert part["index"].to_pylist() == list(range(span.start, span.stop))
@@ -80,7 +82,9 @@ def test_the_tables_say_what_the_trajectories_do(exported, trajectories):
 def test_the_state_is_no_shortcut_to_the_placement(exported):
     """A policy of LeRobot is given `observation.state` and the images."""
     features = info_of(exported("lerobot"))["features"]
-    assert features["observation.state"]["names"] == ["gripper", "gripper_rate"]
+    assert features["observation.state"]["names"] == [
+        "gripper", "gripper_rate", "up_x", "up_y", "up_z"
+    ]  # fmt: skip
     assert "relative to the tool pose commanded for t" in features["action"]["info"]["convention"]
     side = json.loads((exported("lerobot") / SIDE).read_text())
     assert side["cameras"]["wrist"]["frame"] == "tool" and side["robot"] == "ur5e_2f85"
