@@ -201,15 +201,38 @@ def test_joints_forces_and_measured_poses_never_enter(dataset, perturbed, with_s
     assert plain.data_hash == other.data_hash
 
 
-def test_where_in_the_world_it_happened_never_enters(dataset, with_steps, open_windows):
-    def moved(steps):
-        T = pose((1.0, -2.0, 0.5), (0.3, 0.2, -1.0))
-        return dataclasses.replace(steps, commanded_Ts_world_tool=T @ steps.commanded_Ts_world_tool)
+def _moved(T):
+    """Steps as they would have been recorded in another place."""
 
+    def moved(steps):
+        return dataclasses.replace(
+            steps,
+            commanded_Ts_world_tool=T @ steps.commanded_Ts_world_tool,
+            measured_Ts_world_tool=T @ steps.measured_Ts_world_tool,
+        )
+
+    return moved
+
+
+def test_where_in_the_world_it_happened_never_enters(dataset, with_steps, open_windows):
     plain = open_windows(dataset)
-    other = open_windows(with_steps(dataset, moved))
+    other = open_windows(with_steps(dataset, _moved(pose((1.0, -2.0, 0.5), (0.0, 0.0, -1.0)))))
     assert torch.allclose(plain.actions, other.actions, atol=1e-7)
+    assert torch.allclose(plain.up, other.up, atol=1e-7)
     assert torch.equal(plain.frames.images["wrist"], other.frames.images["wrist"])
+
+
+def test_how_the_tool_is_tilted_enters(dataset, with_steps, open_windows):
+    plain = open_windows(dataset)
+    T = pose((1.0, -2.0, 0.5), (0.3, 0.0, 0.0))
+    tilted = open_windows(with_steps(dataset, _moved(T)))
+    assert torch.allclose(plain.actions, tilted.actions, atol=1e-7)
+    # The tools of these steps stand upright in the world.
+    assert torch.allclose(plain.up, torch.tensor([0.0, 0.0, 1.0]))
+    expected = torch.tensor([0.0, np.sin(0.3), np.cos(0.3)], dtype=torch.float32)
+    assert torch.allclose(tilted.up, expected)
+    assert torch.allclose(tilted.batch(torch.arange(3))["up"], expected)
+    assert tilted.normalisation().up_mean == pytest.approx(expected.tolist())
 
 
 def test_shifts_move_all_of_a_windows_images_alike_and_repeat_the_edge(dataset, open_windows):
