@@ -300,6 +300,9 @@ from .robots.spec import (
     GripperSpec as GripperSpec,
 )
 from .robots.spec import (
+    MeshShape as MeshShape,
+)
+from .robots.spec import (
     RobotSpec as RobotSpec,
 )
 from .robots.spec import (
@@ -313,6 +316,9 @@ from .robots.spec import (
 )
 from .robots.spec import (
     look_at as look_at,
+)
+from .robots.spec import (
+    mass_from_density as mass_from_density,
 )
 from .robots.visuals import RobotVisuals as RobotVisuals
 from .scenes.appearance import (

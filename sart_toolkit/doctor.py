@@ -224,7 +224,7 @@ def probe_pybullet() -> str:
     from sart_toolkit.backends.raycast import RayCaster
     from sart_toolkit.poses import pose
     from sart_toolkit.robots.spec import CameraSpec, Shape, look_at
-    from sart_toolkit.robots.visuals import shape_mesh
+    from sart_toolkit.robots.visuals import body_meshes
     from sart_toolkit.scenes.spec import Light
 
     client = pybullet.connect(pybullet.DIRECT)
@@ -236,7 +236,7 @@ def probe_pybullet() -> str:
     height = pybullet.getBasePositionAndOrientation(ball)[0][2]
     pybullet.disconnect(client)
     _check_fall(height)
-    caster = RayCaster({"ball": [shape_mesh(Shape("sphere", (0.1,)))]}, Light())
+    caster = RayCaster({"ball": body_meshes([Shape("sphere", (0.1,))])}, Light())
     at = np.array([0, 0, height])
     camera = CameraSpec("camera", "world", look_at(at + [1, 0, 0], at, np.array([0, 0, 1.0])))
     image = caster.view(camera, np.eye(4), (32, 32), {"ball": pose(at)})

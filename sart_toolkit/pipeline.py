@@ -176,8 +176,18 @@ def task_of(source: Referring, task: TaskLike | None = None) -> Task:
 
     Raises:
         UnknownName: it can't be found.
+        Mismatch: a mesh of its scene is another than when the demonstration was recorded.
     """
-    return _find(source, "task", task, get_task)
+    found = _find(source, "task", task, get_task)
+    if isinstance(source, Demonstration):
+        known, now = source.task_parameters.get("meshes", {}), found.scene.mesh_digests
+        for name in sorted({*known, *now}):
+            if known.get(name) != now.get(name):
+                raise Mismatch(
+                    f"body {name!r} of {found.name}: its mesh is another than when the "
+                    "demonstration was recorded; restore the file, or record again"
+                )
+    return found
 
 
 def robot_of(source: Referring, robot: RobotLike | None = None) -> RobotSpec:

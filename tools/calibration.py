@@ -35,7 +35,7 @@ from sart_toolkit.poses import Array, apply_motion, distance, inverse, pose
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import CameraSpec, Shape, look_at
-from sart_toolkit.robots.visuals import shape_mesh
+from sart_toolkit.robots.visuals import body_meshes
 from sart_toolkit.scenes.spec import Body, Light, SceneSpec
 
 _ROBOT = "ur5e_2f85"
@@ -101,7 +101,7 @@ def drawing(name: str, board: Board) -> Iterator[Artist]:
     """What draws: "raycast", the board alone, or a backend with the ability, robot and board."""
     body = board_body(board)
     if name == "raycast":
-        caster = RayCaster({body.name: [shape_mesh(shape) for shape in body.shapes]}, Light())
+        caster = RayCaster({body.name: body_meshes(body.shapes)}, Light())
         at = {body.name: body.T_world_body}
         yield lambda q, camera, width, height: caster.view(camera, np.eye(4), (width, height), at)
         return

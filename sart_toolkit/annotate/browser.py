@@ -41,7 +41,7 @@ from sart_toolkit.data.records import PrecisionSphere
 from sart_toolkit.record.webpage import LET_GO, WebPage, place, wxyz
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.robots.visuals import RobotVisuals, shape_mesh
+from sart_toolkit.robots.visuals import RobotVisuals, body_meshes
 from sart_toolkit.scenes.spec import SceneSpec
 
 # The actions that have keys, as rows of buttons.
@@ -185,8 +185,8 @@ class AnnotationPage:
         for body in self._scene.bodies:
             if body.name in session.demonstration.body_Ts_world:
                 node = add.add_frame(f"/bodies/{body.name}", show_axes=False)
-                for i, shape in enumerate(body.shapes):
-                    page.add_mesh(f"/bodies/{body.name}/{i}", shape_mesh(shape))
+                for i, mesh in enumerate(body_meshes(body.shapes)):
+                    page.add_mesh(f"/bodies/{body.name}/{i}", mesh)
                 self._bodies[body.name] = node
         self._joints: dict[str, Any] = {}
         for joint, meshes in self._robot.bodies.items():

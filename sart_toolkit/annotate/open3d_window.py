@@ -47,7 +47,7 @@ from sart_toolkit.errors import InvalidInput, MissingExtra
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals, shape_mesh
+from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals, body_meshes
 from sart_toolkit.scenes.spec import SceneSpec
 
 try:
@@ -238,7 +238,7 @@ class AnnotationWindow:
         for body in self._scene.bodies:
             if body.name in self._session.demonstration.body_Ts_world:
                 T = self._session.demonstration.body_Ts_world[body.name][0]
-                for i, mesh in enumerate(map(shape_mesh, body.shapes)):
+                for i, mesh in enumerate(body_meshes(body.shapes)):
                     name = f"body {body.name} {i}"
                     add(name, _shaded(mesh, T), _plain())
                     self._bodies.append((name, body.name))

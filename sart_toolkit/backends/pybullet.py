@@ -9,6 +9,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from sart_toolkit.robots.spec import (
     RobotSpec,
     check_image_size,
 )
-from sart_toolkit.robots.visuals import RobotVisuals, shape_mesh
+from sart_toolkit.robots.visuals import RobotVisuals, body_meshes
 from sart_toolkit.scenes.spec import Body, Joint, SceneSpec, SceneState
 
 
@@ -157,8 +158,10 @@ class PyBulletBackend(Simulator):
         """Load a body and those that move on it as one multibody."""
         c = self._client
         moving = {b.name: b for b in self.scene.bodies if b.joint and b.joint.parent == root.name}
-        with _urdf_file(_scene_urdf(root, moving.values())) as path:
-            index = c.loadURDF(path, useFixedBase=root.mass is None, flags=_URDF_FLAGS)
+        with tempfile.TemporaryDirectory(prefix="sart-scene-") as folder:
+            path = Path(folder) / "body.urdf"
+            path.write_text(_scene_urdf(root, moving.values(), path.parent), encoding="utf-8")
+            index = c.loadURDF(str(path), useFixedBase=root.mass is None, flags=_URDF_FLAGS)
         self._bodies[root.name] = index, -1
         # PyBullet's base is a body's centre of mass with its principal axes.
         dynamics = c.getDynamicsInfo(index, -1)
@@ -483,7 +486,7 @@ class _Drawing:
         self._robot = RobotVisuals(model)
         bodies = {f"joint {name}": meshes for name, meshes in self._robot.bodies.items()}
         for body in scene.bodies:
-            bodies[f"body {body.name}"] = tuple(shape_mesh(shape) for shape in body.shapes)
+            bodies[f"body {body.name}"] = tuple(body_meshes(body.shapes))
         self._caster = RayCaster(bodies, scene.light)
         self._found: dict[tuple[str, tuple[tuple[str, float], ...]], dict[str, Array]] = {}
 
@@ -529,11 +532,12 @@ class _Drawing:
         return self._found[frame, gripper]
 
 
-def _scene_urdf(root: Body, moving: Iterable[Body]) -> str:
-    """A URDF of a body and of those that move on it."""
+def _scene_urdf(root: Body, moving: Iterable[Body], folder: Path) -> str:
+    """A URDF of a body and of those that move on it; their meshes are written to the folder."""
     robot = ET.Element("robot", name=root.name)
-    for body in (root, *moving):
-        robot.append(rigid_link(body.name, body.shapes, body.mass or 0.0))
+    for number, body in enumerate((root, *moving)):
+        mass = body.mass or 0.0
+        robot.append(rigid_link(body.name, body.shapes, mass, folder, f"{number:03d}"))
         if body.joint is not None:
             joint = add_joint(
                 robot, f"{body.name}_joint", root.name, body.name,

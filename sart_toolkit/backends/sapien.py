@@ -37,6 +37,7 @@ from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import (
     CameraSpec,
+    ConvexShape,
     ImageSize,
     RobotSpec,
     Shape,
@@ -471,23 +472,23 @@ class _Physics:
         self, component: Any, body: Body, group: int, ignored: tuple[int, int]
     ) -> None:
         for shape in body.shapes:
-            if shape.collides:
+            for part in shape.convex_parts() if shape.collides else ():
                 T = shape.T_body_shape
-                self._attach(component, body.name, shape, T, body.friction, group, ignored)
+                self._attach(component, body.name, part, T, body.friction, group, ignored)
 
     def _attach(
         self,
         component: Any,
         name: str,
-        shape: Shape | str,
+        shape: ConvexShape | str,
         T: Array,
         friction: float,
         group: int,
         ignored: tuple[int, int],
     ) -> None:
-        """Give a body a convex shape, or the convex mesh of a file, at `T (4, 4)`."""
+        """Give a body a primitive, a hull by its corners, or that of a file, at `T (4, 4)`."""
         material = sapien.physx.PhysxMaterial(friction, friction, 0.0)
-        if isinstance(shape, str):
+        if not isinstance(shape, Shape):
             made = sapien.physx.PhysxCollisionShapeConvexMesh(shape, [1.0, 1.0, 1.0], material)
         elif shape.kind == "box":
             half = [edge / 2 for edge in shape.size]

@@ -26,8 +26,9 @@ from sart_toolkit.backends.interface import CameraView
 from sart_toolkit.collision.parts import primitive
 from sart_toolkit.errors import CannotWrite, MissingCapability, MissingExtra
 from sart_toolkit.poses import Array
-from sart_toolkit.robots.spec import CameraSpec, Shape
-from sart_toolkit.robots.urdf import cache_dir
+from sart_toolkit.robots.references import cache_dir
+from sart_toolkit.robots.spec import CameraSpec, MeshShape, Shape
+from sart_toolkit.robots.visuals import body_meshes
 from sart_toolkit.scenes.spec import Light, SceneSpec
 
 try:
@@ -297,7 +298,8 @@ class Renderer:
         for body in scene.bodies:
             entity = self._bodies[body.name] = _Drawn()
             for shape in body.shapes:
-                entity.add(_shape(shape))
+                for drawn in _meshes(shape) if isinstance(shape, MeshShape) else [_shape(shape)]:
+                    entity.add(drawn)
         for drawn in (*self._joints.values(), *self._bodies.values()):
             drawn.join(self._scene)
         self._add_light(scene.light)
@@ -403,6 +405,23 @@ def _shape(shape: Shape) -> Any:
         made = sapien.render.RenderShapeCylinder(radius, length / 2, material)
         T = T @ ALONG_Z
     made.local_pose = sapien_pose(T)
+    return made
+
+
+def _meshes(shape: MeshShape) -> list[Any]:
+    made = []
+    for mesh in body_meshes([shape]):
+        material = sapien.render.RenderMaterial(base_color=list(mesh.rgba))
+        uvs = np.zeros((len(mesh.vertices), 2), np.float32)
+        made.append(
+            sapien.render.RenderShapeTriangleMesh(
+                mesh.vertices.astype(np.float32),
+                mesh.triangles.astype(np.uint32),
+                mesh.normals.astype(np.float32),
+                uvs,
+                material,
+            )
+        )
     return made
 
 

@@ -27,7 +27,7 @@ def scene_digest(model: RobotModel, scene: SceneSpec) -> str:
     """
     what = [
         (
-            [(s.kind, s.size, s.T_body_shape, s.collides) for s in body.shapes],
+            [(*s.identity, s.T_body_shape, s.collides) for s in body.shapes],
             (body.name, body.mass, body.friction, body.joint),
         )
         for body in scene.bodies

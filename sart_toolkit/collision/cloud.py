@@ -34,8 +34,9 @@ from sart_toolkit.poses import (
     frozen,
     inverse,
 )
+from sart_toolkit.robots.meshes import nearest_on
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import Attachment, RobotSpec, Shape
+from sart_toolkit.robots.spec import Attachment, BodyShape, MeshShape, RobotSpec
 from sart_toolkit.scenes.spec import SceneSpec
 
 _log = logging.getLogger(__name__)
@@ -946,8 +947,10 @@ def surface_errors(
     return errors
 
 
-def _surface_distance(shape: Shape, p: Array) -> Array:
+def _surface_distance(shape: BodyShape, p: Array) -> Array:
     """The distance `(n,)` [m] of points in a shape's frame to its surface, from either side."""
+    if isinstance(shape, MeshShape):
+        return np.linalg.norm(nearest_on(np.array(shape.mesh().triangles), p) - p, axis=1)
     if shape.kind == "sphere":
         return np.abs(np.linalg.norm(p, axis=1) - shape.size[0])
     if shape.kind == "box":

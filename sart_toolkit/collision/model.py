@@ -17,6 +17,7 @@ from sart_toolkit.collision.parts import (
     ConvexPart,
     coal_geometry,
     coal_transform,
+    corners_of,
     robot_parts,
 )
 from sart_toolkit.errors import InvalidInput, unknown_name
@@ -94,10 +95,12 @@ class CollisionModel:
                     "it; let one collide, or draw it as part of another body"
                 )
         self._shapes = [
-            (body.name, shape.T_body_shape, coal_geometry(shape), shape.corners())
+            (body.name, T_body_shape, coal_geometry(part), corners_of(part, T_body_shape))
             for body in scene.bodies
             for shape in body.shapes
             if shape.collides
+            for part in shape.convex_parts()
+            for T_body_shape in [shape.T_body_shape]
         ]
         home = _link_poses(self.kinematics)
         self.T_joint_tool = home[robot.tool_frame]

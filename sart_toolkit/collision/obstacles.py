@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from sart_toolkit.collision.cloud import SceneCloud
 from sart_toolkit.collision.hull import Hull, polyhedron_about
-from sart_toolkit.collision.parts import ConvexPart, coal_transform
+from sart_toolkit.collision.parts import ConvexPart, coal_geometry, coal_transform
 from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, check_array
 
@@ -186,16 +186,9 @@ def hull_part(name: str, joint: int, points: Array) -> ConvexPart:
     points = check_array(f"points of {name}", points, (None, 3))
     corners = points[Hull(points).corners]
     try:
-        geometry = _convex(corners)
+        geometry = coal_geometry(corners)
     except RuntimeError:
         # coal has a corner meet 255 others at most.
         corners = polyhedron_about(corners)
-        geometry = _convex(corners)
+        geometry = coal_geometry(corners)
     return ConvexPart(name, joint, geometry, np.eye(4), corners)
-
-
-def _convex(corners: Array) -> coal.CollisionGeometry:
-    listed = coal.StdVec_Vec3s()
-    for corner in corners:
-        listed.append(corner)
-    return coal.ConvexBase.convexHull(listed, False, "Qt")

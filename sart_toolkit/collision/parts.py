@@ -14,7 +14,7 @@ import pinocchio as pin
 from sart_toolkit.errors import BrokenFile, InvalidInput
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import Shape
+from sart_toolkit.robots.spec import ConvexShape, Shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +129,24 @@ def primitive(geometry: coal.CollisionGeometry) -> Shape:
     )
 
 
-def coal_geometry(shape: Shape) -> coal.CollisionGeometry:
-    """A shape as coal takes it, at its own origin."""
+def coal_geometry(shape: ConvexShape) -> coal.CollisionGeometry:
+    """A primitive, or the hull of corners, as coal takes it, in its own frame."""
+    if not isinstance(shape, Shape):
+        listed = coal.StdVec_Vec3s()
+        for corner in shape:
+            listed.append(corner)
+        return coal.ConvexBase.convexHull(listed, False, "Qt")
     if shape.kind == "box":
         return coal.Box(*shape.size)
     if shape.kind == "sphere":
         return coal.Sphere(*shape.size)
     return coal.Cylinder(*shape.size)
+
+
+def corners_of(shape: ConvexShape, T_body_shape: Array) -> Array:
+    """Points `(n, 3)` in the body frame whose hull encloses a convex shape in its place."""
+    points = shape.corners() if isinstance(shape, Shape) else shape
+    return points @ T_body_shape[:3, :3].T + T_body_shape[:3, 3]
 
 
 def coal_transform(T: Array) -> coal.Transform3s:

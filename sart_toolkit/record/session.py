@@ -492,6 +492,8 @@ class TeleopSession:
             **self.config.references,
         }
         parameters: dict[str, Any] = {"placement": self.placement.to_json()}
+        if digests := self.task.scene.mesh_digests:
+            parameters["meshes"] = digests
         if self.backend.delays:
             parameters["image_delays"] = self.backend.delays
         if self.config.appearance is not None:

@@ -15,7 +15,7 @@ from sart_toolkit.poses import Array
 from sart_toolkit.report.figures import SegmentPath, sphere_colour
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import RobotSpec
-from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals, shape_mesh
+from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals, body_meshes
 from sart_toolkit.scenes.spec import SceneSpec
 
 # Together with two themes of pictures and 1 MB of films a page stays below 3 MB.
@@ -125,7 +125,7 @@ def _scene_bodies(demonstration: Demonstration, scene: SceneSpec, at: Array) -> 
         (
             "scene",
             _still(demonstration.body_Ts_world[body.name][at]),
-            [shape_mesh(shape) for shape in body.shapes],
+            body_meshes(body.shapes),
         )
         for body in scene.bodies
         if body.name in demonstration.body_Ts_world

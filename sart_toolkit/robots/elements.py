@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sart_toolkit.poses import Array, rpy_pose
-from sart_toolkit.robots.spec import Shape, mass_properties
+from sart_toolkit.robots.spec import BodyShape, ConvexShape, MeshShape, Shape, mass_properties
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 def child_of(element: ET.Element, tag: str) -> ET.Element:
@@ -111,15 +116,52 @@ def add_joint(
     return joint
 
 
-def rigid_link(name: str, shapes: Sequence[Shape], mass: float) -> ET.Element:
-    """A URDF link of primitives, its inertia that of an even mass [kg]; 0 for one that is fixed."""
+def rigid_link(
+    name: str, shapes: Sequence[BodyShape], mass: float, folder: Path, number: str = ""
+) -> ET.Element:
+    """A URDF link of shapes, its inertia that of an even mass [kg]; 0 for one that is fixed.
+
+    Args:
+        name: of the link.
+        shapes: what it is made of.
+        mass: [kg].
+        folder: where the meshes are written that it names, beside the URDF.
+        number: tells its meshes from those of other links in the folder.
+    """
     link = ET.Element("link", name=name)
     link.append(inertial_of(mass, *mass_properties(shapes, mass or 1.0)))
+    stem = f"{number}_{file_stem(name)}"
     for index, shape in enumerate(shapes):
-        for kind in ("visual", "collision") if shape.collides else ("visual",):
-            element = ET.SubElement(link, kind)
+        drawn: Sequence[tuple[Shape | trimesh.Trimesh, tuple[float, float, float, float]]]
+        drawn = shape.drawn() if isinstance(shape, MeshShape) else [(shape, shape.rgba)]
+        for piece, (what, rgba) in enumerate(drawn):
+            element = ET.SubElement(link, "visual")
             element.append(origin_of(shape.T_body_shape))
-            element.append(geometry_of(shape))
-            if kind == "visual":
-                element.append(material_of(f"{name}_{index}", shape.rgba))
+            at = f"{index}" if len(drawn) == 1 else f"{index}_{piece}"
+            element.append(_written(what, folder / f"{stem}_visual_{at}.obj"))
+            element.append(material_of(f"{name}_{at}", rgba))
+        for piece, part in enumerate(shape.convex_parts() if shape.collides else ()):
+            element = ET.SubElement(link, "collision")
+            element.append(origin_of(shape.T_body_shape))
+            element.append(_written(part, folder / f"{stem}_collision_{index}_{piece}.obj"))
     return link
+
+
+def file_stem(name: str) -> str:
+    """A name as part of a file's, safe for any file system."""
+    return re.sub(r"[^A-Za-z0-9]+", "_", name)[:40]
+
+
+def _written(what: ConvexShape | trimesh.Trimesh, path: Path) -> ET.Element:
+    """The `<geometry>` of a primitive, or of a mesh or hull, which is written to a file."""
+    if isinstance(what, Shape):
+        return geometry_of(what)
+    from sart_toolkit.robots.meshes import hull_mesh, write_obj
+
+    if isinstance(what, np.ndarray):
+        write_obj(hull_mesh(what), path)
+    else:
+        write_obj(what, path, normals=True)
+    geometry = ET.Element("geometry")
+    ET.SubElement(geometry, "mesh", filename=path.name)
+    return geometry

@@ -25,7 +25,7 @@ Faces = NDArray[np.intp]
 _SLACK = 1e-7
 TOLERANCE = 1e-5
 # What stands out by less than this [m] is skin, and the part that is nearest takes it in.
-_SKIN = 5e-3
+SKIN = 5e-3
 # A part takes in what stands out farther where that adds at most this times its own hull's volume.
 _FATTER = 1.0
 _MAX_NEW_PARTS = 8
@@ -166,7 +166,7 @@ def enclose(parts: Sequence[Part], vertices: Array, faces: Faces) -> list[Part]:
         faces: the triangles' corners `(n, 3)`, by index.
     """
     made = list(parts)
-    loose = _take_in(made, vertices, faces, _SKIN)
+    loose = _take_in(made, vertices, faces, SKIN)
     added = 0
     for piece in _pieces(vertices, loose)[:_MAX_PIECES]:
         piece = piece[standing_out(made, vertices, piece) > _SLACK]
@@ -183,7 +183,7 @@ def enclose(parts: Sequence[Part], vertices: Array, faces: Faces) -> list[Part]:
         more, i, grown = min(options, key=lambda option: option[0], default=(np.inf, -1, new))
         if options and (
             more <= _FATTER * new.volume
-            or made[i].outside(points).max() <= _SKIN
+            or made[i].outside(points).max() <= SKIN
             or added >= _MAX_NEW_PARTS
         ):
             made[i] = grown

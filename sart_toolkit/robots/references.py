@@ -20,11 +20,21 @@ _DRIVE = re.compile(r"[A-Za-z]:/")
 _IN_PACKAGE = re.compile(r"(?:package|model)://([^/]+)/(.+)")
 
 
-def resource_path(resource: str) -> Path:
+def cache_dir() -> Path:
+    """Where derived files are kept: `$SART_CACHE`, or the user's cache directory."""
+    root = os.environ.get("SART_CACHE") or os.environ.get("XDG_CACHE_HOME")
+    return Path(root or Path.home() / ".cache") / "sart_toolkit"
+
+
+def resource_path(resource: str, remedy: str = "check the robot's urdf entries") -> Path:
     """The file that `package:path/inside/it` or a plain path names; `sart_toolkit:` is `assets/`.
 
     A package is a module that Python can import, or what pip installed under that name; the path
     of the latter starts where pip installs.
+
+    Args:
+        resource: names the file.
+        remedy: what to do where it isn't there.
 
     Raises:
         MissingExtra: the package isn't installed.
@@ -46,7 +56,7 @@ def resource_path(resource: str) -> Path:
     else:
         path = local_file(resource)
     if not path.is_file():
-        raise MissingFile(f"{resource}: no such file ({path.name}); check the robot's urdf entries")
+        raise MissingFile(f"{resource}: no such file ({path.name}); {remedy}")
     return path
 
 

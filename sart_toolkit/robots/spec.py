@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import hashlib
+import logging
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -13,7 +15,12 @@ from sart_toolkit.errors import InvalidInput
 from sart_toolkit.poses import Array, check_array, check_pose, check_positive, frozen
 from sart_toolkit.robots.references import resource_path
 
+if TYPE_CHECKING:
+    import trimesh
+
+_log = logging.getLogger(__name__)
 _SIDES = 16
+_GREY = (0.7, 0.7, 0.7, 1.0)
 
 
 @dataclass(frozen=True)
@@ -27,7 +34,7 @@ class Shape:
     kind: Literal["box", "cylinder", "sphere"]
     size: tuple[float, ...]
     T_body_shape: Array = field(default_factory=lambda: np.eye(4))
-    rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+    rgba: tuple[float, float, float, float] = _GREY
     collides: bool = True
 
     def __post_init__(self) -> None:
@@ -46,6 +53,15 @@ class Shape:
         T = check_pose("T_body_shape", self.T_body_shape)
         object.__setattr__(self, "T_body_shape", frozen(T))
 
+    @property
+    def identity(self) -> tuple[Hashable, ...]:
+        """What tells it from shapes of another form, wherever they are."""
+        return self.kind, self.size
+
+    def convex_parts(self) -> tuple[ConvexShape, ...]:
+        """The convex parts that it collides as, in its own frame: itself."""
+        return (Shape(self.kind, self.size),)
+
     def corners(self) -> Array:
         """Points `(n, 3)` in the body frame whose convex hull encloses the shape.
 
@@ -63,27 +79,225 @@ class Shape:
         return points @ self.T_body_shape[:3, :3].T + self.T_body_shape[:3, 3]
 
 
-def mass_properties(shapes: Sequence[Shape], mass: float) -> tuple[Array, Array]:
+@dataclass(frozen=True)
+class MeshShape:
+    """A shape of a body from a mesh file, at `T_body_shape (4, 4)`.
+
+    `file` is a path or `package:path/inside/it`, of type STL, OBJ, PLY, OFF, GLB or DAE; `scale`
+    makes its lengths metres, one number or one for each axis. It collides as convex parts that
+    enclose it, as `collision` says:
+
+    - "hull": its convex hull, which fills hollows and handles;
+    - "decomposed": parts that CoACD finds, an extra;
+    - a tuple of files: the hulls of these meshes, of the same frame and scale. What stands out of
+      them by less than 5 mm is taken in, more is refused.
+
+    `rgba` in [0, 1]; where it is `None` the mesh has the colours that are in its file, or grey.
+    `texture` is an image to be laid on it; each triangle is drawn in one colour, and there are at
+    most 32. A shape with `collides` false is only drawn.
+
+    Attributes:
+        digests: of all files that decide where it is and how it collides, by their content.
+
+    Raises:
+        MissingFile: a file isn't there.
+        BrokenFile: a file can't be read.
+        InvalidInput: a mesh is empty, too large or too small, a file is of another type, or the
+            parts leave some of the mesh out.
+        MissingExtra: what reads or decomposes it isn't installed.
+    """
+
+    file: str
+    scale: float | tuple[float, float, float] = 1.0
+    collision: Literal["hull", "decomposed"] | tuple[str, ...] = "hull"
+    T_body_shape: Array = field(default_factory=lambda: np.eye(4))
+    rgba: tuple[float, float, float, float] | None = None
+    texture: str | None = None
+    collides: bool = True
+    digests: tuple[str, ...] = field(init=False, repr=False)
+    _texture_digest: str = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        from sart_toolkit.robots import meshes
+
+        given = self.collision
+        if isinstance(given, str):
+            if given not in ("hull", "decomposed"):
+                raise InvalidInput(
+                    f"collision of mesh {self._name}: expected 'hull', 'decomposed' or a tuple of "
+                    f"files, got {given!r}"
+                )
+            files: tuple[str, ...] = ()
+        else:
+            files = tuple(map(str, given))
+            if not files:
+                raise InvalidInput(
+                    f"collision of mesh {self._name}: has no file; name one, or take 'hull'"
+                )
+            object.__setattr__(self, "collision", files)
+        object.__setattr__(self, "file", str(self.file))
+        scale = self.scale if isinstance(self.scale, tuple) else (self.scale,)
+        if len(scale) not in (1, 3):
+            raise InvalidInput(
+                f"scale of mesh {self._name}: expected 1 or 3 numbers, got {len(scale)}"
+            )
+        for value in scale:
+            check_positive(f"scale of mesh {self._name}", value)
+        T = check_pose("T_body_shape", self.T_body_shape)
+        object.__setattr__(self, "T_body_shape", frozen(T))
+        paths = [_mesh_file(name) for name in (self.file, *files)]
+        for path in paths:
+            meshes.check_type(path)
+        digests = tuple(meshes.file_digest(path) for path in paths)
+        object.__setattr__(self, "digests", digests)
+        meshes.check_body_mesh(self.mesh(), self._name)
+        object.__setattr__(self, "_texture_digest", "")
+        if self.texture is not None:
+            if self.rgba is not None:
+                raise InvalidInput(f"mesh {self._name}: has rgba and texture; give one of them")
+            object.__setattr__(self, "texture", str(self.texture))
+            digest = meshes.file_digest(_mesh_file(str(self.texture)))
+            object.__setattr__(self, "_texture_digest", digest)
+            meshes.check_texture(paths[0], digests[0], (_mesh_file(str(self.texture)), digest))
+        if given == "decomposed":
+            meshes.check_coacd(self._name)
+        else:
+            self.convex_parts()
+
+    @property
+    def _name(self) -> str:
+        return Path(self.file).name
+
+    @property
+    def _scale(self) -> tuple[float, float, float]:
+        x, y, z = self.scale if isinstance(self.scale, tuple) else (self.scale,) * 3
+        return float(x), float(y), float(z)
+
+    @property
+    def identity(self) -> tuple[Hashable, ...]:
+        """What tells it from shapes of another form, wherever they are: its files' content."""
+        how = self.collision if isinstance(self.collision, str) else "parts"
+        return "mesh", self.digests, self._scale, how
+
+    @property
+    def digest(self) -> str:
+        """A SHA-256 of its form: the content of its files, scale, and how it collides."""
+        return hashlib.sha256(repr(self.identity).encode()).hexdigest()
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Its mesh, scaled, in its own frame; not to be changed.
+
+        Raises:
+            BrokenFile: the file has changed since the shape was made.
+        """
+        from sart_toolkit.robots import meshes
+
+        return meshes.read_mesh(_mesh_file(self.file), self.digests[0], self._scale)
+
+    def drawn(self) -> tuple[tuple[trimesh.Trimesh, tuple[float, float, float, float]], ...]:
+        """What is drawn of it, in its own frame: meshes of one colour each."""
+        from sart_toolkit.robots import meshes
+
+        if self.rgba is not None:
+            return ((meshes.creased(self.mesh()), self.rgba),)
+        texture = (_mesh_file(self.texture), self._texture_digest) if self.texture else None
+        path = _mesh_file(self.file)
+        pieces = meshes.drawn_pieces(path, self.digests[0], self._scale, texture)
+        return tuple((mesh, rgba or _GREY) for mesh, rgba in pieces)
+
+    def convex_parts(self) -> tuple[ConvexShape, ...]:
+        """The convex parts that enclose it, in its own frame: corners `(n, 3)` [m] of hulls."""
+        from sart_toolkit.robots import meshes
+
+        path, *others = (_mesh_file(file) for file in self._geometry_files)
+        known = path, self.digests[0], self._scale
+        if self.collision == "hull" or (self.collision == "decomposed" and not self.collides):
+            return (meshes.mesh_hull(*known),)
+        given = tuple(zip(others, self.digests[1:], strict=True))
+        return meshes.enclosing_parts(*known, given or None)
+
+    @property
+    def _geometry_files(self) -> tuple[str, ...]:
+        return self.file, *(() if isinstance(self.collision, str) else self.collision)
+
+    def files_needed(self) -> list[Path]:
+        """The files that it is made from."""
+        textures = () if self.texture is None else (self.texture,)
+        return [_mesh_file(file) for file in (*self._geometry_files, *textures)]
+
+    def corners(self) -> Array:
+        """Points `(n, 3)` in the body frame whose convex hull encloses the shape."""
+        points = np.concatenate([np.asarray(part) for part in self.convex_parts()])
+        return points @ self.T_body_shape[:3, :3].T + self.T_body_shape[:3, 3]
+
+
+BodyShape = Shape | MeshShape
+# A primitive at its own origin, or the corners `(n, 3)` [m] of a convex hull.
+ConvexShape = Shape | Array
+
+
+def _mesh_file(name: str) -> Path:
+    return resource_path(name, "check the path of the mesh or texture")
+
+
+def mass_properties(shapes: Sequence[BodyShape], mass: float) -> tuple[Array, Array]:
     """The centre of mass `(3,)` [m] and the inertia `(3, 3)` [kg m²] about it, body axes.
 
     The mass [kg] is spread evenly over the volume of the shapes that collide, or of all shapes
-    where none does; where two overlap both count.
+    where none does; where two overlap both count. A mesh that isn't closed counts as its hull.
     """
     # Pinocchio's inertias need a mass for each shape, so volumes all the same, and a robot as data
     # doesn't need Pinocchio.
-    solid = [shape for shape in shapes if shape.collides] or list(shapes)
-    volumes, moments = zip(*(_volume_and_moments(shape) for shape in solid), strict=True)
-    masses = mass * np.array(volumes) / sum(volumes)
-    p = np.stack([shape.T_body_shape[:3, 3] for shape in solid])
+    solids = [_solid(shape) for shape in _heavy(shapes)]
+    masses = mass * np.array([volume for _, volume, _, _ in solids])
+    masses /= sum(volume for _, volume, _, _ in solids)
+    p = np.stack([centre for _, _, centre, _ in solids])
     centre = masses @ p / mass
     inertia = np.zeros((3, 3))
-    for m, moment, shape, offset in zip(masses, moments, solid, p - centre, strict=True):
-        R = shape.T_body_shape[:3, :3]
+    for m, (_, _, _, moments), offset in zip(masses, solids, p - centre, strict=True):
         # Steiner's theorem.
-        inertia += m * (
-            R @ np.diag(moment) @ R.T + offset @ offset * np.eye(3) - np.outer(offset, offset)
-        )
+        inertia += m * (moments + offset @ offset * np.eye(3) - np.outer(offset, offset))
     return centre, inertia
+
+
+def mass_from_density(shapes: Sequence[BodyShape], density: float) -> float:
+    """The mass [kg] of shapes at a density [kg/m³].
+
+    Those that collide count, or all shapes where none does; where two overlap both count. Of a
+    mesh that isn't closed nobody knows the volume, so its hull's is taken, and a warning says so.
+    """
+    check_positive("density", density, "kg/m³")
+    mass = 0.0
+    for shape in _heavy(shapes):
+        closed, volume, _, _ = _solid(shape)
+        mass += density * volume
+        if not closed:
+            assert isinstance(shape, MeshShape)
+            _log.warning(
+                "mesh %s: isn't closed, so its hull's volume is taken: %.3g kg; close it, or give "
+                "the mass",
+                Path(shape.file).name, density * volume,
+            )  # fmt: skip
+    return mass
+
+
+def _heavy(shapes: Sequence[BodyShape]) -> list[BodyShape]:
+    return [shape for shape in shapes if shape.collides] or list(shapes)
+
+
+def _solid(shape: BodyShape) -> tuple[bool, float, Array, Array]:
+    """Whether a shape is closed, its volume [m³], centre `(3,)` [m] and inertia per mass there.
+
+    The inertia `(3, 3)` [m²] is about body axes.
+    """
+    R, p = shape.T_body_shape[:3, :3], shape.T_body_shape[:3, 3]
+    if isinstance(shape, MeshShape):
+        from sart_toolkit.robots.meshes import solid
+
+        closed, volume, centre, inertia = solid(shape.mesh())
+        return closed, volume, R @ centre + p, R @ inertia @ R.T
+    volume, moments = _volume_and_moments(shape)
+    return True, volume, p, R @ np.diag(moments) @ R.T
 
 
 def _volume_and_moments(shape: Shape) -> tuple[float, Array]:
@@ -105,7 +319,7 @@ class Attachment:
 
     name: str
     frame: str
-    shapes: tuple[Shape, ...]
+    shapes: tuple[BodyShape, ...]
     T_frame_body: Array = field(default_factory=lambda: np.eye(4))
     mass: float = 0.1
 
@@ -332,6 +546,8 @@ class RobotSpec:
 
     def files_needed(self) -> list[Path]:
         """The URDFs that are named by a path, and the meshes that they name.
+
+        Meshes of attachments are added by the parcel that holds them.
 
         Raises:
             MissingFile, BrokenFile: a URDF can't be read.

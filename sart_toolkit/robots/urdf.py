@@ -11,15 +11,11 @@ import dataclasses
 import functools
 import hashlib
 import importlib.metadata
-import importlib.util
-import io
 import json
 import logging
 import os
-import re
 import shutil
 import tempfile
-import time
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,7 +28,6 @@ from sart_toolkit.errors import (
     BrokenFile,
     CannotWrite,
     InvalidInput,
-    MissingExtra,
     SartError,
     unknown_name,
 )
@@ -40,6 +35,7 @@ from sart_toolkit.poses import Array, inverse
 from sart_toolkit.robots.elements import (
     add_joint,
     child_of,
+    file_stem,
     floats,
     geometry_of,
     inertia_of,
@@ -61,8 +57,16 @@ from sart_toolkit.robots.enclosure import (
     standing_out,
 )
 from sart_toolkit.robots.joints import moving_groups, set_joints
-from sart_toolkit.robots.references import mesh_path, resource_path, where_to_look
-from sart_toolkit.robots.source import links_and_joints, parsed, read_bytes
+from sart_toolkit.robots.meshes import (
+    check_mesh,
+    check_type,
+    creased,
+    file_digest,
+    read_mesh,
+    write_obj,
+)
+from sart_toolkit.robots.references import cache_dir, mesh_path, resource_path, where_to_look
+from sart_toolkit.robots.source import links_and_joints, parsed
 from sart_toolkit.robots.spec import (
     Attachment,
     RobotSpec,
@@ -76,16 +80,10 @@ _warned: set[str] = set()
 _RECIPE = 16
 # What shades and hulls: another version may make other meshes.
 _MADE_WITH = ("trimesh", "scipy", "numpy")
-# Faces that meet at a sharper angle show an edge.
-_CREASE_DEG = 30.0
 _GRIPPER_PREFIX = "gripper_"
 # What a link of no mass of its own gets [kg].
 FRAME_MASS = 1e-3
 _MANIFEST = "manifest.json"
-_MESH_TYPES = (".dae", ".glb", ".obj", ".off", ".ply", ".stl")
-_MAX_MESH_BYTES = 100 << 20
-# No link is larger [m].
-_MAX_EXTENT = 10.0
 # A link given a mass but no inertia has that of a ball of this radius [m].
 _BALL_RADIUS = 0.05
 # A link that moves and has no mass gets that of its hull at this density [kg/m³].
@@ -94,12 +92,6 @@ _DENSITY = 1000.0
 _ROUNDING = 1e-6
 _ORIGIN = "world_origin"
 _NOTES = "notes.json"
-
-
-def cache_dir() -> Path:
-    """Where derived files are kept: `$SART_CACHE`, or the user's cache directory."""
-    root = os.environ.get("SART_CACHE") or os.environ.get("XDG_CACHE_HOME")
-    return Path(root or Path.home() / ".cache") / "sart_toolkit"
 
 
 def composed_urdf(spec: RobotSpec, held: Sequence[Attachment] = ()) -> Path:
@@ -144,9 +136,9 @@ def _key(spec: RobotSpec, attachments: Sequence[Attachment], sources: Sequence[P
     """A hash of all that the composed robot is made from: its data and its files' contents."""
     files = []
     for source in sources:
-        digest = _digest(source)
+        digest = file_digest(source)
         meshes = {
-            name: _digest(path) if os.path.isfile(path) else None
+            name: file_digest(path) if os.path.isfile(path) else None
             for name in _mesh_names(source, digest)
             for path in [mesh_path(name, source, spec.package_dirs)]
         }
@@ -167,29 +159,6 @@ def _versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in _MADE_WITH}
 
 
-_digests: dict[tuple[str, int, int, int], str] = {}
-
-
-def _digest(path: Path) -> str:
-    """The SHA-256 of a file's content, remembered in this process while the file is untouched.
-
-    Raises:
-        BrokenFile: it can't be read.
-    """
-    try:
-        found = path.stat()
-    except OSError as error:
-        raise BrokenFile(f"{path.name}: can't be read ({error.strerror}); check it") from error
-    key = str(path), found.st_size, found.st_mtime_ns, found.st_ino
-    if key not in _digests:
-        digest = hashlib.sha256(read_bytes(path, _MAX_MESH_BYTES)).hexdigest()
-        # A file written just now may be written again within the same tick of its clock.
-        if time.time_ns() - found.st_mtime_ns < 2_000_000_000:
-            return digest
-        _digests[key] = digest
-    return _digests[key]
-
-
 @functools.lru_cache(maxsize=64)
 def _mesh_names(source: Path, digest: str) -> tuple[str, ...]:
     """The mesh files that a URDF of that content names."""
@@ -202,7 +171,7 @@ def source_files(source: Path, package_dirs: Sequence[str] = ()) -> list[Path]:
     Raises:
         BrokenFile: the URDF can't be read.
     """
-    names = _mesh_names(source, _digest(source))
+    names = _mesh_names(source, file_digest(source))
     meshes = [mesh_path(name, source, package_dirs) for name in names]
     return [source, *(path for path in meshes if os.path.isfile(path))]
 
@@ -230,7 +199,7 @@ def _intact(directory: Path) -> bool:
         files = json.loads((directory / _MANIFEST).read_bytes())
         there = {path.name for path in directory.iterdir()}
         return there == {*files, _MANIFEST} and all(
-            _digest(directory / name) == digest for name, digest in files.items()
+            file_digest(directory / name) == digest for name, digest in files.items()
         )
     except (OSError, ValueError, TypeError, AttributeError):
         return False
@@ -251,7 +220,7 @@ def _make(
         made.mkdir()
         notes = _compose(spec, attachments, sources, made)
         (made / _NOTES).write_text(json.dumps(notes, indent=1))
-        files = {path.name: _digest(path) for path in sorted(made.iterdir())}
+        files = {path.name: file_digest(path) for path in sorted(made.iterdir())}
         (made / _MANIFEST).write_text(json.dumps(files, indent=1))
         if _key(spec, attachments, sources) != key:
             raise BrokenFile(f"{spec.name}: its files changed while they were read; try again")
@@ -310,7 +279,7 @@ def _compose(
         add_joint(robot, f"{child}_fixed", parent, child, T, "fixed")
     robot.append(ET.Element("link", name=spec.tool_frame))
     for body in attachments:
-        robot.append(rigid_link(body.name, body.shapes, body.mass))
+        robot.append(rigid_link(body.name, body.shapes, body.mass, work, f"{len(robot):03d}"))
     for kind in ("link", "joint"):
         names = [element.get("name") for element in robot.findall(kind)]
         twice = sorted({str(name) for name in names if names.count(name) > 1})
@@ -484,7 +453,7 @@ def _prepare(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
     name = link.get("name", "")
     colour = spec.link_colours.get(name, (0.6, 0.6, 0.62, 1.0))
     paths = [base / mesh.get("filename", "") for mesh in link.iter("mesh")]
-    digests = tuple(_digest(path) if os.path.isfile(path) else "" for path in paths)
+    digests = tuple(file_digest(path) if os.path.isfile(path) else "" for path in paths)
     key = ET.tostring(link, encoding="unicode"), digests
     if key not in _prepared:
         if len(_prepared) >= _MOST_LINKS:
@@ -494,7 +463,7 @@ def _prepare(link: ET.Element, base: Path, work: Path, number: str, spec: RobotS
     made = ET.fromstring(text)
     link[:] = list(made)
     # Names that no two links share, and that are safe for any file system.
-    stem = f"{number}_{re.sub(r'[^A-Za-z0-9]+', '_', name)[:40]}"
+    stem = f"{number}_{file_stem(name)}"
     for mesh in link.iter("mesh"):
         mesh.set("filename", f"{stem}_{mesh.get('filename')}")
     for file, content in files.items():
@@ -528,7 +497,9 @@ def _prepare_meshes(link: ET.Element, base: Path, work: Path) -> None:
     for element in [*visuals, *collisions]:
         mesh = element.find("geometry/mesh")
         if mesh is not None:
-            _check_mesh(_loaded(mesh, base), name, element.tag, mesh.get("filename", ""))
+            file = Path(mesh.get("filename", "")).name
+            what = f"link {name!r}: {element.tag} mesh {file}"
+            check_mesh(_loaded(mesh, base), what, 'give its <mesh> scale="0.001 0.001 0.001"')
     vertices, faces = drawn_triangles(link, base)
     parts = _enclosed(link, base, vertices, faces)
     _write_parts(link, parts, work)
@@ -636,15 +607,10 @@ def _write_parts(link: ET.Element, parts: Sequence[Part], work: Path) -> None:
             element.append(geometry_of(part.shape))
 
 
-def creased(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with normals at its corners: smooth, but for edges where faces meet sharply."""
-    return trimesh.graph.smooth_shade(mesh, angle=np.deg2rad(_CREASE_DEG), facet_minarea=None)
-
-
 def _export(
     mesh: trimesh.Trimesh, element: ET.Element, work: Path, file: str, normals: bool = False
 ) -> None:
-    mesh.export(work / file, include_normals=normals, include_texture=False, digits=9)
+    write_obj(mesh, work / file, normals)
     element.set("filename", file)
     element.attrib.pop("scale", None)
 
@@ -662,58 +628,8 @@ def _loaded(element: ET.Element, base: Path) -> trimesh.Trimesh:
         MissingExtra: what reads its type isn't installed.
     """
     source = base / element.get("filename", "")
-    if source.suffix.lower() not in _MESH_TYPES:
-        raise InvalidInput(
-            f"mesh {source.name}: expected a file ending in {', '.join(_MESH_TYPES)}; convert it"
-        )
-    if source.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
-        raise MissingExtra(
-            f"mesh {source.name}: Collada files need pycollada; pip install 'sart_toolkit[meshes]'"
-        )
+    check_type(source)
     if not os.path.isfile(source):
         raise BrokenFile(f"mesh {source.name} is missing; put it there")
-    return _mesh(source, _digest(source), tuple(floats(element.get("scale", "1 1 1"))))
-
-
-@functools.lru_cache(maxsize=16)
-def _mesh(source: Path, digest: str, scale: tuple[float, ...]) -> trimesh.Trimesh:
-    """The mesh of a file of that content, scaled; not to be changed."""
-    content = read_bytes(source, _MAX_MESH_BYTES)
-    try:
-        # From bytes, so that no other file that it names is read.
-        mesh = trimesh.load(
-            io.BytesIO(content), file_type=source.suffix[1:].lower(), force="mesh", process=False
-        )
-        assert isinstance(mesh, trimesh.Trimesh)
-        # Processing drops corners that aren't finite, and all triangles at them.
-        if mesh.vertices.ndim != 2 or mesh.vertices.shape[1] != 3:
-            raise ValueError("corners without three coordinates")
-        if not np.isfinite(mesh.vertices).all():
-            raise ValueError("NaN or infinite vertices")
-        mesh.process()
-        mesh.apply_scale(scale)
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    except Exception as error:
-        raise BrokenFile(
-            f"mesh {source.name}: can't be read ({type(error).__name__}: {error}); export it again"
-        ) from error
-    return mesh
-
-
-def _check_mesh(mesh: trimesh.Trimesh, link: str, kind: str, file: str) -> None:
-    """Return if a mesh can be enclosed; holes and flat triangles do that no harm.
-
-    Raises:
-        InvalidInput: it has no faces, numbers that aren't finite, or is far too large.
-    """
-    what = f"link {link!r}: {kind} mesh {Path(file).name}"
-    if not len(mesh.faces):
-        raise InvalidInput(f"{what} has no triangles; export it again")
-    if not np.isfinite(mesh.vertices).all():
-        raise InvalidInput(f"{what} has NaN or infinite vertices; export it again")
-    if np.abs(mesh.vertices).max() > _MAX_EXTENT:
-        raise InvalidInput(
-            f"{what} reaches {np.abs(mesh.vertices).max():.4g} m from its origin, expected at most "
-            f"{_MAX_EXTENT:g} m; if its file is in millimetres, give its <mesh> "
-            'scale="0.001 0.001 0.001"'
-        )
+    x, y, z = floats(element.get("scale", "1 1 1"))
+    return read_mesh(source, file_digest(source), (x, y, z))

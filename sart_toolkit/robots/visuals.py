@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +14,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from sart_toolkit.poses import Array
+from sart_toolkit.robots.meshes import creased
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import Shape, check_gripper
-from sart_toolkit.robots.urdf import creased, drawn_elements
+from sart_toolkit.robots.spec import BodyShape, MeshShape, Shape, check_gripper
+from sart_toolkit.robots.urdf import drawn_elements
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +38,17 @@ class DrawnMesh:
         return DrawnMesh(self.vertices @ R + T[:3, 3], self.triangles, self.normals @ R, self.rgba)
 
 
-def shape_mesh(shape: Shape) -> DrawnMesh:
-    """A shape's mesh in the frame of its body."""
-    mesh = _primitive_mesh(shape.kind, shape.size)
-    return _drawn(mesh, shape.rgba).moved(shape.T_body_shape)
+def body_meshes(shapes: Iterable[BodyShape]) -> list[DrawnMesh]:
+    """What is drawn of a body of these shapes, in its frame; of each colour a mesh."""
+    return [
+        _drawn(mesh, rgba).moved(shape.T_body_shape)
+        for shape in shapes
+        for mesh, rgba in (
+            shape.drawn()
+            if isinstance(shape, MeshShape)
+            else ((_primitive_mesh(shape.kind, shape.size), shape.rgba),)
+        )
+    ]
 
 
 # Scenes in other colours have the same shapes.
@@ -123,8 +131,13 @@ def _link_meshes(urdf: Path) -> dict[str, list[DrawnMesh]]:
     found: dict[str, list[DrawnMesh]] = {}
     for link in ET.parse(urdf).getroot().findall("link"):
         meshes = [
-            shape_mesh(what) if isinstance(what, Shape) else _drawn(what, rgba).moved(T_link_mesh)
+            mesh
             for what, T_link_mesh, rgba in drawn_elements(link, urdf.parent)
+            for mesh in (
+                body_meshes([what])
+                if isinstance(what, Shape)
+                else [_drawn(what, rgba).moved(T_link_mesh)]
+            )
         ]
         if meshes:
             found[link.get("name", "")] = meshes

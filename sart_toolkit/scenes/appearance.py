@@ -11,8 +11,10 @@ import numpy as np
 
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import Array, exp_rotation, inverse, orthonormalised, pose
-from sart_toolkit.robots.spec import CameraSpec, RobotSpec, Shape
+from sart_toolkit.robots.spec import BodyShape, CameraSpec, RobotSpec, Shape
 from sart_toolkit.scenes.spec import Body, SceneSpec
+
+_Rgba = tuple[float, float, float, float]
 
 # What distractors are, with their lengths per half of their height.
 _FORMS: tuple[tuple[Literal["box", "cylinder", "sphere"], tuple[float, ...]], ...] = (
@@ -200,18 +202,19 @@ def _distractors(
     return shapes
 
 
-def _recoloured(body: Body, rng: np.random.Generator, spread: float) -> tuple[Shape, ...]:
-    """The body's shapes; those of one colour get one other colour."""
-    changed = {}
-    for rgba in _in_order(shape.rgba for shape in body.shapes):
+def _recoloured(body: Body, rng: np.random.Generator, spread: float) -> tuple[BodyShape, ...]:
+    """The body's shapes; those of one colour get one other, meshes keep those of their files."""
+    changed: dict[_Rgba, _Rgba] = {}
+    for rgba in _in_order(shape.rgba for shape in body.shapes if shape.rgba is not None):
         rgb = np.clip(np.array(rgba[:3]) + rng.uniform(-spread, spread, 3), 0.0, 1.0)
         changed[rgba] = (float(rgb[0]), float(rgb[1]), float(rgb[2]), rgba[3])
-    return tuple(dataclasses.replace(shape, rgba=changed[shape.rgba]) for shape in body.shapes)
+    return tuple(
+        shape if shape.rgba is None else dataclasses.replace(shape, rgba=changed[shape.rgba])
+        for shape in body.shapes
+    )
 
 
-def _in_order(
-    colours: Iterable[tuple[float, float, float, float]],
-) -> list[tuple[float, float, float, float]]:
+def _in_order(colours: Iterable[_Rgba]) -> list[_Rgba]:
     return list(dict.fromkeys(colours))
 
 

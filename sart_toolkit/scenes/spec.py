@@ -1,4 +1,4 @@
-"""A scene as data: bodies made of convex shapes, joints between them, light, what is held."""
+"""A scene as data: bodies of primitives and meshes, joints between them, light, what is held."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sart_toolkit.poses import (
     log_rotation,
     pose,
 )
-from sart_toolkit.robots.spec import Attachment, CameraSpec, Shape, check_gripper
+from sart_toolkit.robots.spec import Attachment, BodyShape, CameraSpec, MeshShape, check_gripper
 
 _LIMIT_TOLERANCE = 1e-6
 _POSE_TOLERANCE = 1e-6
@@ -121,7 +121,7 @@ class Body:
     """
 
     name: str
-    shapes: tuple[Shape, ...]
+    shapes: tuple[BodyShape, ...]
     T_world_body: Array = field(default_factory=lambda: np.eye(4))
     mass: float | None = None
     friction: float = 0.5
@@ -194,6 +194,21 @@ class SceneSpec:
                     f"body without mass, which {body.name!r} moves on,", body.joint.parent, still
                 )
         object.__setattr__(self, "gravity", frozen(check_array("gravity", self.gravity, (3,))))
+
+    @property
+    def meshes(self) -> dict[str, list[MeshShape]]:
+        """The meshes of each body that has some, standing or held, by its name."""
+        bodies: list[Body | Attachment] = [*self.bodies, *self.held]
+        found = {
+            body.name: [shape for shape in body.shapes if isinstance(shape, MeshShape)]
+            for body in bodies
+        }
+        return {name: shapes for name, shapes in found.items() if shapes}
+
+    @property
+    def mesh_digests(self) -> dict[str, list[str]]:
+        """What tells the meshes from others, by their files' content, by the body's name."""
+        return {name: [s.digest for s in shapes] for name, shapes in self.meshes.items()}
 
     @property
     def jointed(self) -> dict[str, Body]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -121,6 +122,11 @@ class Task(abc.ABC):
 
         None, `[]`, if only a person can do it.
         """
+
+    def files_needed(self) -> list[Path]:
+        """The files of the scene's meshes, which work on another machine needs as well."""
+        meshes = self.scene.meshes.values()
+        return [file for shapes in meshes for shape in shapes for file in shape.files_needed()]
 
     def achieved(
         self, success: NDArray[np.bool_], record_hz: int = DEFAULT_RATES.record_hz

@@ -11,6 +11,10 @@ What is left, measured against exact distances:
 - boxes, spheres and cylinders: less than 0.001 mm;
 - meshes: 0 to 0.06 mm too far, never too near by more than 0.005 mm: Bullet moves the corners of a
   hull inwards, to a grid of 1/10216 of its extent. So what overlaps by more than that is found.
+
+A mesh of a standing body is no hull here but all of its triangles, as they are in its file, so that
+convex parts which leave some of it out show as well. It is hollow: what is wholly inside is clear.
+In the grasp its convex parts stand for it.
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ from scipy.spatial.transform import Rotation
 from sart_toolkit.backends.pybullet import p
 from sart_toolkit.errors import unknown_name
 from sart_toolkit.poses import Array, check_array, check_pose, inverse, rpy_pose
-from sart_toolkit.robots.spec import RobotSpec, Shape, check_gripper
+from sart_toolkit.robots.spec import ConvexShape, MeshShape, RobotSpec, Shape, check_gripper
 from sart_toolkit.robots.urdf import composed_urdf
 from sart_toolkit.scenes.spec import SceneSpec
 
@@ -64,13 +68,14 @@ _NOTHING = Nearest("", "", np.inf)
 
 @dataclass(frozen=True)
 class _Part:
-    """One convex part: a link's, or a shape of a body of the scene.
+    """One convex part: a link's, or a shape of a body of the scene; or the triangles of a mesh.
 
     Attributes:
         name: of the link or body.
         index: PyBullet's number.
         T_owner_part: its pose `(4, 4)` in the link or body.
-        spheres: `(n, 4)` centre and radius [m], in the part's frame, that together enclose it.
+        spheres: `(n, 4)` centre and radius [m], in the part's frame, that together enclose it;
+            none of triangles, which only stand.
         half: half edges `(3,)` [m] of a box around it, at its origin; grown by `radius` [m].
     """
 
@@ -176,12 +181,20 @@ class ClosestPoints:
         # Every part is a body of its own: PyBullet sets no margin of a link's shape, nor of a
         # compound's.
         self._parts = [self._load_part(*element) for element in collision_geometry(urdf)]
-        self._shapes = [
-            self._load_part(body.name, Shape(shape.kind, shape.size), shape.T_body_shape)
-            for body in scene.bodies
-            for shape in body.shapes
-            if shape.collides
-        ]
+        # What stands for a body in the grasp, and for one that stands.
+        self._in_grasp: list[_Part] = []
+        self._standing: list[_Part] = []
+        for body in scene.bodies:
+            for shape in filter(lambda shape: shape.collides, body.shapes):
+                parts = [
+                    self._load_part(body.name, part, shape.T_body_shape)
+                    for part in shape.convex_parts()
+                ]
+                self._in_grasp += parts
+                if isinstance(shape, MeshShape):
+                    parts = [self._load_surface(body.name, shape)]
+                self._standing += parts
+        self._shapes = self._standing
         self._carriers: dict[int, _Carrier] = {}
         self._placed: set[int] = set()
         self.place(scene.initial_state(robot.home, 0.0).Ts_world_body, 0.0)
@@ -219,7 +232,7 @@ class ClosestPoints:
             motion.append(np.linalg.solve(rows, np.reshape(seen, (4, 16))).reshape(4, 4, 4))
         self._motion = np.stack(motion, axis=1)
 
-    def _load_part(self, name: str, geometry: Shape | Array, T_owner_part: Array) -> _Part:
+    def _load_part(self, name: str, geometry: ConvexShape, T_owner_part: Array) -> _Part:
         """Load a primitive, or the convex hull of points `(n, 3)`, as a body without margin."""
         c, radius = self._client, 0.0
         sizes: dict[str, Any]
@@ -241,6 +254,21 @@ class ClosestPoints:
         p.changeDynamics(body, -1, collisionMargin=0.0, physicsClientId=c)
         half = np.abs(points).max(0)
         return _Part(name, body, T_owner_part, cover_spheres(points, radius), half, radius)
+
+    def _load_surface(self, name: str, shape: MeshShape) -> _Part:
+        """Load all triangles of a mesh as a body without margin."""
+        c, mesh = self._client, shape.mesh()
+        index = p.createCollisionShape(
+            p.GEOM_MESH,
+            vertices=(_SCALE * mesh.vertices).tolist(),
+            indices=mesh.faces.ravel().tolist(),
+            flags=p.GEOM_FORCE_CONCAVE_TRIMESH,
+            physicsClientId=c,
+        )
+        body = p.createMultiBody(0.0, index, physicsClientId=c)
+        p.changeDynamics(body, -1, collisionMargin=0.0, physicsClientId=c)
+        half = np.abs(mesh.vertices).max(0)
+        return _Part(name, body, shape.T_body_shape, np.zeros((0, 4)), half, 0.0)
 
     # --- placing --------------------------------------------------------------------------------
 
@@ -282,16 +310,11 @@ class ClosestPoints:
             p.resetJointState(self._robot, self._gripper[name], at, physicsClientId=c)
         tool = self._links[self.robot.tool_frame]
         moving = [(part, self._links[part.name], part.T_owner_part) for part in self._parts]
-        moving += [
-            (part, tool, Ts_tool[part.name] @ part.T_owner_part)
-            for part in self._shapes
-            if part.name in Ts_tool
-        ]
-        standing = [
-            (part, Ts_world[part.name] @ part.T_owner_part)
-            for part in self._shapes
-            if part.name in Ts_world
-        ]
+        grasped = [part for part in self._in_grasp if part.name in Ts_tool]
+        still = [part for part in self._standing if part.name in Ts_world]
+        self._shapes = [*grasped, *still]
+        moving += [(part, tool, Ts_tool[part.name] @ part.T_owner_part) for part in grasped]
+        standing = [(part, Ts_world[part.name] @ part.T_owner_part) for part in still]
         for part, T in standing:
             self._put(part, *_position_and_quaternion(T))
         self._set_arm(np.zeros(len(self._arm)))
@@ -417,7 +440,8 @@ class ClosestPoints:
     def pair(self, q: Array, a: str, b: str, within: float = np.inf) -> float:
         """The distance [m] of two links or bodies at `q (n,)` [rad]; infinite beyond `within`.
 
-        Any two may be asked for, also those that `nearest` ignores. No part is left out.
+        Any two may be asked for, also those that `nearest` ignores, but for two standing bodies
+        with meshes. No part is left out.
 
         Raises:
             InvalidInput: `q` has the wrong shape or isn't finite.

@@ -5,6 +5,7 @@ A seed decides all. Nothing here computes a distance with coal.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
@@ -14,11 +15,13 @@ import numpy as np
 from sart_toolkit.errors import InvalidInput, MotionRejected, Unreachable
 from sart_toolkit.poses import Array, check_poses, exp_rotation, interpolate, inverse, pose
 from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.meshes import hull_mesh, nearest_on
 from sart_toolkit.robots.model import RobotModel
-from sart_toolkit.robots.spec import Shape
+from sart_toolkit.robots.spec import BodyShape, ConvexShape, MeshShape, Shape
 from sart_toolkit.scenes.spec import Body, SceneSpec
 from sart_toolkit.tasks.parts import TABLE, tool_down
 from sart_toolkit.testing.closest import collision_geometry, cover_spheres
+from sart_toolkit.testing.vessels import VESSEL_HEIGHT, funnel, mug, mug_parts, written
 
 # Where clutter stands and tools go [m].
 LOWER, UPPER = np.array([0.25, -0.4, 0.0]), np.array([0.75, 0.4, 0.6])
@@ -27,7 +30,7 @@ _LONGEST, _SHORTEST, _WIDEST_TURN = 0.20, 0.02, 0.4
 _SIDEWAYS_SHARE = 0.2
 _TRIES = 1000
 
-_Placed = tuple[Shape, Array]
+_Placed = tuple[BodyShape, Array]
 
 
 # --- scenes -----------------------------------------------------------------------------------
@@ -66,11 +69,21 @@ def mixed(rng: np.random.Generator) -> SceneSpec:
     return _scene("thing", [_draw(rng, partial(_tilted, kind=i % 3)) for i in range(n)])
 
 
+def crockery(rng: np.random.Generator) -> SceneSpec:
+    """A table with 12 to 16 meshes, upright or tilted anyhow: mugs with a handle, and funnels.
+
+    Every other mug collides as the convex parts that it is made of, all else as its hull.
+    """
+    n = int(rng.integers(12, 17))
+    return _scene("mesh", [_draw(rng, partial(_vessel, kind=i % 3)) for i in range(n)])
+
+
 CLUTTER: dict[str, Callable[[np.random.Generator], SceneSpec]] = {
     "boxes": box_clutter,
     "rods": rod_forest,
     "shelf": shelf,
     "mixed": mixed,
+    "meshes": crockery,
 }
 
 
@@ -129,6 +142,21 @@ def _tilted(rng: np.random.Generator, kind: int) -> _Placed:
     return Shape("sphere", (rng.uniform(0.02, 0.06),)), T
 
 
+def _vessel(rng: np.random.Generator, kind: int) -> _Placed:
+    """A mug of its parts, a mug's hull or a funnel's, 6 to 12 cm high, half of them standing."""
+    # Of few sizes, since parts are made anew for each.
+    scale = float(rng.choice([0.06, 0.09, 0.12])) / VESSEL_HEIGHT
+    if kind == 2:
+        shape = MeshShape(str(written(funnel())), scale)
+    else:
+        parts = tuple(str(written(part)) for part in mug_parts())
+        shape = MeshShape(str(written(mug())), scale, "hull" if kind else parts)
+    p = rng.uniform(LOWER, UPPER)
+    if rng.random() < 0.5:
+        return shape, pose([*p[:2], 0.0], [0, 0, rng.uniform(-np.pi, np.pi)])
+    return shape, _anyhow(rng, p)
+
+
 def _shelf_shapes(rng: np.random.Generator) -> tuple[Shape, ...]:
     """Three or four boards, dividers between them, four legs, a side and a rail along the front."""
     n = int(rng.integers(3, 5))
@@ -160,11 +188,12 @@ def _direction(rng: np.random.Generator) -> Array:
     return v / np.linalg.norm(v)
 
 
-def _is_clear(shape: Shape, T_world_shape: Array) -> bool:
+def _is_clear(shape: BodyShape, T_world_shape: Array) -> bool:
     """Whether a shape keeps off all that the robot may be at home: a box around it does."""
     spheres = _home_spheres()
     local = spheres[:, :3] @ T_world_shape[:3, :3] + inverse(T_world_shape)[:3, 3]
-    half = Shape(shape.kind, shape.size).corners().max(0)
+    at_origin = dataclasses.replace(shape, T_body_shape=np.eye(4))
+    half = np.abs(at_origin.corners()).max(0)
     outside = np.linalg.norm(np.maximum(np.abs(local) - half, 0.0), axis=1)
     return bool((outside > spheres[:, 3] + _HOME_GAP).all())
 
@@ -292,17 +321,20 @@ def _tool_rotation(rng: np.random.Generator) -> Array:
 def _position_beside(
     body: Body, R_world_tool: Array, p_tool_points: Array, gap: float, rng: np.random.Generator
 ) -> Array:
-    """Where to put the tool `(3,)` so that its nearest point is `gap` off one of a body's shapes.
+    """Where to put the tool `(3,)` so that its nearest point is `gap` off one of a body's parts.
 
-    The shape, being convex, lies behind the plane through its point nearest to a random place,
+    The part, being convex, lies behind the plane through its point nearest to a random place,
     square to the way there; the tool is put before it.
     """
     shapes = [shape for shape in body.shapes if shape.collides]
     shape = shapes[rng.integers(len(shapes))]
     T = body.T_world_body @ shape.T_body_shape
+    parts = shape.convex_parts()
+    # A shape that is its own part takes nothing from the generator.
+    part = parts[rng.integers(len(parts))] if len(parts) > 1 else parts[0]
     while True:
         place = rng.uniform(LOWER, UPPER)
-        nearest = _nearest_point(shape, T, place)
+        nearest = _nearest_point(part, T, place)
         way = float(np.linalg.norm(place - nearest))
         if way > 1e-6:
             break
@@ -312,11 +344,16 @@ def _position_beside(
     return nearest + gap * normal - first
 
 
-def _nearest_point(shape: Shape, T_world_shape: Array, p_world: Array) -> Array:
-    """The point `(3,)` of a shape that is nearest to a place: that itself where it is inside."""
+def _nearest_point(shape: ConvexShape, T_world_shape: Array, p_world: Array) -> Array:
+    """The point `(3,)` of a shape that is nearest to a place: that itself where it is inside.
+
+    Of a hull it is on the surface.
+    """
     R = T_world_shape[:3, :3]
     p = R.T @ (p_world - T_world_shape[:3, 3])
-    if shape.kind == "box":
+    if not isinstance(shape, Shape):
+        p = nearest_on(np.array(hull_mesh(shape).triangles), p[None])[0]
+    elif shape.kind == "box":
         half = np.array(shape.size) / 2
         p = np.clip(p, -half, half)
     elif shape.kind == "cylinder":

@@ -11,7 +11,7 @@ from sart_toolkit.backends import raycast
 from sart_toolkit.backends.raycast import RayCaster
 from sart_toolkit.poses import inverse, pose
 from sart_toolkit.robots.spec import CameraSpec, Shape
-from sart_toolkit.robots.visuals import shape_mesh
+from sart_toolkit.robots.visuals import body_meshes
 from sart_toolkit.scenes.spec import Light
 
 SIZE = 48, 32
@@ -25,7 +25,7 @@ def _camera(**changes):
 
 def _see(bodies, Ts, light=FLAT, camera=None, size=SIZE, T_world_camera=None, carried=None):
     """An image from the origin along z; bodies are of one shape each."""
-    caster = RayCaster({name: [shape_mesh(shape)] for name, shape in bodies.items()}, light)
+    caster = RayCaster({name: body_meshes([shape]) for name, shape in bodies.items()}, light)
     T = np.eye(4) if T_world_camera is None else T_world_camera
     return caster.view(camera or _camera(), T, size, Ts, carried)
 
@@ -156,7 +156,7 @@ def test_bodies_that_move_with_the_camera_look_as_any_others():
         "table": Shape("box", (3, 3, 0.1), rgba=BLUE),
     }
     light = Light(rng.normal(size=3), shadows=True)
-    caster = RayCaster({name: [shape_mesh(shape)] for name, shape in bodies.items()}, light)
+    caster = RayCaster({name: body_meshes([shape]) for name, shape in bodies.items()}, light)
     near = {"hand": _random_pose(rng, 0.5), "held": _random_pose(rng, 0.6)}
     for _ in range(3):
         T = _random_pose(rng, 0.0)

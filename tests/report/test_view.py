@@ -27,7 +27,7 @@ from sart_toolkit.report.view import (
 )
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals, shape_mesh
+from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals, body_meshes
 from sart_toolkit.scenes.spec import Body, SceneSpec
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -165,7 +165,7 @@ def test_meshes_fit_a_page_and_their_triangles_name_corners_that_are_there(whole
 
 
 def test_a_simpler_mesh_stays_close_and_closed() -> None:
-    ball = shape_mesh(Shape("sphere", (0.1,)))
+    ball = body_meshes([Shape("sphere", (0.1,))])[0]
     simple = simplified(ball, 0.02)
     assert 100 < len(simple.triangles) < 0.6 * len(ball.triangles)
     radii = np.linalg.norm(simple.vertices, axis=1)

@@ -14,9 +14,9 @@ import trimesh
 from sart_toolkit.errors import BrokenFile, CannotWrite, InvalidInput, MissingExtra, MissingFile
 from sart_toolkit.poses import pose, rpy_pose
 from sart_toolkit.robots import urdf as urdf_module
-from sart_toolkit.robots.references import resource_path
+from sart_toolkit.robots.references import cache_dir, resource_path
 from sart_toolkit.robots.spec import Attachment, Shape
-from sart_toolkit.robots.urdf import assumptions, cache_dir, composed_urdf
+from sart_toolkit.robots.urdf import assumptions, composed_urdf
 
 BOX = (Shape("box", (0.02, 0.02, 0.02)),)
 

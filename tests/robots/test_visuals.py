@@ -8,7 +8,7 @@ from sart_toolkit.poses import pose
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import Shape
-from sart_toolkit.robots.visuals import RobotVisuals, shape_mesh
+from sart_toolkit.robots.visuals import RobotVisuals, body_meshes
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from sart_toolkit.robots.visuals import RobotVisuals, shape_mesh
     ],
 )
 def test_a_shape_is_drawn_in_its_size_and_place(shape, half):
-    mesh = shape_mesh(Shape(shape.kind, shape.size, pose([1, 2, 3]), (1, 0, 0, 0.5)))
+    mesh = body_meshes([Shape(shape.kind, shape.size, pose([1, 2, 3]), (1, 0, 0, 0.5))])[0]
     centre, size = mesh.vertices.mean(0), np.ptp(mesh.vertices, axis=0)
     np.testing.assert_allclose(centre, [1, 2, 3], atol=1e-9)
     np.testing.assert_allclose(size / 2, half, atol=1e-9)
@@ -36,7 +36,7 @@ def model(peg_task):
 
 
 def test_round_sides_are_smooth_and_edges_are_sharp():
-    mesh = shape_mesh(Shape("cylinder", (0.1, 0.5)))
+    mesh = body_meshes([Shape("cylinder", (0.1, 0.5))])[0]
     cap = np.abs(mesh.normals[:, 2]) > 0.5
     np.testing.assert_allclose(np.abs(mesh.normals[cap, 2]), 1.0, atol=1e-9)
     side = mesh.normals[~cap]

@@ -38,7 +38,7 @@ def shapes(scene):
 
 
 def numbers(scene):
-    return [(s.kind, s.size, T.tolist()) for s, T in shapes(scene)]
+    return [(s.identity, T.tolist()) for s, T in shapes(scene)]
 
 
 # --- scenes -------------------------------------------------------------------------------------

@@ -127,16 +127,25 @@ def test_a_measured_program_that_fails_is_reported():
 def test_the_certificate_benchmark_counts_verdicts_and_what_they_miss(capsys):
     assert bench.main(["certificate", "--segments", "20", "--samples", "60", "--seed", "3"]) == 0
     figures = json.loads(capsys.readouterr().out.splitlines()[-1])["figures"]
-    assert figures["segments"] == 20 and len(figures["scenes"]) == 10
+    assert figures["segments"] == 20 and len(figures["scenes"]) == 11
     assert figures["free"] + figures["collision"] + figures["undecided"] == 20
     assert figures["free"] > 0 and figures["collision"] > 0
     assert figures["unsound"] == figures["falsely_rejected"] == 0 and figures["surprises"] == []
     assert 0 < figures["milliseconds"]["median"] <= figures["milliseconds"]["p99"]
 
 
+def test_the_certificate_benchmark_can_be_of_some_scenes_only(capsys):
+    arguments = "certificate --scenes meshes --segments 4 --samples 60"
+    assert bench.main(arguments.split()) == 0
+    figures = json.loads(capsys.readouterr().out.splitlines()[-1])["figures"]
+    assert figures["segments"] == 4 and list(figures["scenes"]) == ["meshes"]
+    assert figures["unsound"] == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["certificate", "--scenes", "mesh"], "unknown scene 'mesh': did you mean 'meshes'"),
         (["augment", "--repeats", "0"], "--repeats: expected a finite number > 0"),
         (["augment", "--tasks", "peg"], "unknown task 'peg'"),
         (["annotate", "--points", "0"], "--points: expected a finite number > 0"),
