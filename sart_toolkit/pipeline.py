@@ -66,6 +66,7 @@ from sart_toolkit.workers import Workers
 if TYPE_CHECKING:
     from sart_toolkit.annotate.suggest import SuggestConfig
     from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.augment.engine import Watch
     from sart_toolkit.augment.preview import Preview
     from sart_toolkit.augment.strategies import Strategy
     from sart_toolkit.augment.validate import Validation
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     from sart_toolkit.collision.sensor import CloudConfig, SensorErrors
     from sart_toolkit.collision.world import CollisionWorld
     from sart_toolkit.data.formats.format import Arm, Format, Given
+    from sart_toolkit.data.writer import Sources
     from sart_toolkit.evaluate.deploy import Deployment, Judge
     from sart_toolkit.evaluate.rollout import Film, Rollout
     from sart_toolkit.learn.policy import Policy
@@ -215,12 +217,12 @@ def backend_maker(
         UnknownName: the robot, the task or the backend can't be found.
         InvalidInput: the appearance that the recording notes is none.
     """
-    spec, scene = _setting(source, task, robot)
+    spec, scene = setting_of(source, task, robot)
     made = _find(source, "backend", backend, get_backend)
     return functools.partial(make_backend, made, spec, scene, image_size, rates)
 
 
-def _setting(
+def setting_of(
     source: Referring, task: TaskLike | None = None, robot: RobotLike | None = None
 ) -> tuple[RobotSpec, SceneSpec]:
     """The robot and the scene of a recording or skill, as they looked when it was made."""
@@ -605,6 +607,7 @@ def augment(
     progress: Progress = _silent,
     sensor: SensorErrors | None = None,
     ask: Callable[[str], None] | None = None,
+    watch: Callable[[Sources, AugmentConfig], Watch] | None = None,
     **options: Any,
 ) -> Dataset:
     """Trajectories generated from demonstrations' and annotations' files, in directory `out`.
@@ -621,6 +624,8 @@ def augment(
         sensor: with `obstacles` "cloud", what the images may be off by; if left out, what the
             annotation says, where its spheres were suggested from the images.
         ask: where the robot can't be reset: shows a person what to do, returns when it is done.
+        watch: called with what is generated from, and how; what it returns is called with each
+            attempt's key and outcome, see `augment_sources`.
         options: of `AugmentConfig`. Without `n`, a strategy that draws nothing takes the
             demonstrations that there are.
 
@@ -639,7 +644,7 @@ def augment(
     return augment_sources(
         sources, make, out, config, workers, overwrite,
         lambda kept, wanted, rejected: progress("augment", kept, wanted, f"{rejected} rejected"),
-        ask, task_of(first, task),
+        ask, task_of(first, task), None if watch is None else watch(sources, config),
     )  # fmt: skip
 
 
@@ -690,7 +695,7 @@ def preview(
         config.execution, made, [demonstration for demonstration, _ in sources]
     )
     return preview_sources(
-        sources, *_setting(first, task, robot), made.tracking_error, out,
+        sources, *setting_of(first, task, robot), made.tracking_error, out,
         dataclasses.replace(config, execution=execution), workers, overwrite,
         lambda proved, wanted, rejected: progress("plan", proved, wanted, f"{rejected} rejected"),
     )  # fmt: skip
@@ -1468,7 +1473,7 @@ def report(run_dir: Path, out: Path | None = None, *, overwrite: bool = False) -
             check_writable(out, overwrite)
         from sart_toolkit.report.page import write_report
 
-        write_report(run_dir, page, _setting)
+        write_report(run_dir, page, setting_of)
     return page
 
 

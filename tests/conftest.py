@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import signal
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
@@ -31,6 +35,7 @@ from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.tasks import get_task
 from sart_toolkit.tasks.task import Placement, Task
+from sart_toolkit.testing.browser import Browser, find_browser
 
 IMAGE_SIZE = 48
 
@@ -115,6 +120,49 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return line
 
     return refused
+
+
+@pytest.fixture
+def free_port() -> int:
+    """A port of this computer that nobody listens at."""
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        return int(found.getsockname()[1])
+
+
+@pytest.fixture
+def serve(free_port: int) -> Iterator[Callable[..., Any]]:
+    """Starts a `sart` command with --web; the program, once it has said where its page is."""
+    pytest.importorskip("viser")
+    programs = []
+
+    def started(*argv: object) -> Any:
+        command = [sys.executable, "-c", "from sart_toolkit.cli import main; main()"]
+        command += [*map(str, argv), "--web", "--port", str(free_port), "--json"]
+        program: Any = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        programs.append(program)
+        program.said = next(line for line in program.stderr if "ssh" in line)
+        program.url = f"http://127.0.0.1:{free_port}"
+        return program
+
+    yield started
+    for program in programs:
+        with contextlib.suppress(ProcessLookupError):
+            program.kill()
+        program.communicate()
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    """A browser without a window."""
+    try:
+        find_browser()
+    except MissingExtra as error:
+        pytest.skip(str(error))
+    pytest.importorskip("viser")
+    with Browser(1400, 1200) as browser:
+        yield browser
 
 
 class _Limited(Backend):

@@ -1336,8 +1336,7 @@ def bench_page(arguments: Sequence[str]) -> dict[str, Any]:
         assert program.stderr is not None
         try:
             next(line for line in program.stderr if "ssh" in line)
-            browser.open(f"http://127.0.0.1:{port}")
-            browser.wait_for("!!document.querySelector('.sart .message')")
+            browser.open_page(f"http://127.0.0.1:{port}")
             browser.centre("button", "quit")
             time.sleep(5.0)
             for key in _KEYS * options.repeats:

@@ -1,4 +1,4 @@
-"""What the annotator's views draw alike: colours, cloud, sampled tools, where the eye starts."""
+"""What windows and pages draw alike: colours, words, cloud, sampled tools, where the eye starts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from sart_toolkit.annotate.session import AnnotationSession
 from sart_toolkit.annotate.verdict import Word
 from sart_toolkit.collision.cloud import CloudConfig, SceneCloud, fuse_cloud
-from sart_toolkit.data.records import Demonstration, PrecisionSphere
+from sart_toolkit.data.records import Demonstration
 from sart_toolkit.poses import Array, inverse
 from sart_toolkit.robots.spec import RobotSpec
 from sart_toolkit.robots.visuals import DrawnMesh, RobotVisuals
@@ -45,11 +45,21 @@ def fine_cloud(
     return fuse_cloud(demonstration, robot, scene.held, config=fine)
 
 
-def path_colours(session: AnnotationSession) -> Array:
-    """Colours `(T, 3)` in [0, 1] of the path's waypoints, by how clear the tool was there."""
+def path_colours(clearances: Array) -> Array:
+    """Colours `(T, 3)` in [0, 1] of a path, by how clear `(T,)` [m] the tool was."""
     return np.stack(
-        [np.interp(session.clearances, CLEARANCES, channel) for channel in PATH_COLOURS.T], axis=1
+        [np.interp(clearances, CLEARANCES, channel) for channel in PATH_COLOURS.T], axis=1
     )
+
+
+def message_of(session: AnnotationSession) -> str:
+    """What an annotator says at the top."""
+    return session.message or "A suggests all spheres, Enter adds one here"
+
+
+def heading_of(session: AnnotationSession) -> str:
+    """What stands above an annotator's spheres."""
+    return f"{len(session.spheres)} spheres{', not saved' if session.dirty else ''}"
 
 
 def start_view(demonstration: Demonstration) -> tuple[Array, float]:
@@ -64,17 +74,15 @@ def gripper_at(demonstration: Demonstration, t: int) -> float:
     return float(np.clip(demonstration.steps.measured_gripper[t], 0.0, 1.0))
 
 
-def ghost_gripper(demonstration: Demonstration, sphere: PrecisionSphere) -> float:
-    """The opening, to a tenth, with which the poses sampled from a sphere are drawn."""
-    return round(gripper_at(demonstration, sphere.waypoint), 1)
+def ghost_gripper(demonstration: Demonstration, t: int) -> float:
+    """The opening, to a tenth, with which poses sampled about a waypoint are drawn."""
+    return round(gripper_at(demonstration, t), 1)
 
 
-def ghost_meshes(
-    robot: RobotVisuals, demonstration: Demonstration, sphere: PrecisionSphere
-) -> list[DrawnMesh]:
-    """The tool with what it holds, in the tool's frame, as at a sphere's waypoint."""
-    steps, t = demonstration.steps, sphere.waypoint
-    Ts_world_joint = robot.poses_at(steps.joint_positions[t], ghost_gripper(demonstration, sphere))
+def ghost_meshes(robot: RobotVisuals, demonstration: Demonstration, t: int) -> list[DrawnMesh]:
+    """The tool with what it holds, in the tool's frame, as at a waypoint."""
+    steps = demonstration.steps
+    Ts_world_joint = robot.poses_at(steps.joint_positions[t], ghost_gripper(demonstration, t))
     T_tool_world = inverse(steps.measured_Ts_world_tool[t])
     return [
         mesh.moved(T_tool_world @ Ts_world_joint[joint])

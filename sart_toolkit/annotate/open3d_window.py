@@ -36,6 +36,8 @@ from sart_toolkit.annotate.drawing import (
     ghost_gripper,
     ghost_meshes,
     gripper_at,
+    heading_of,
+    message_of,
     path_colours,
     start_view,
 )
@@ -249,7 +251,7 @@ class AnnotationWindow:
             for i, mesh in enumerate(meshes):
                 add(f"robot {joint} {i}", _shaded(mesh, Ts_joint[joint]), _plain())
         Ts = self._session.demonstration.steps.measured_Ts_world_tool
-        add("path", _path(Ts[:, :3, 3], path_colours(self._session)), _line_material(5))
+        add("path", _path(Ts[:, :3, 3], path_colours(self._session.clearances)), _line_material(5))
         add("triads", _triads(Ts, 0.008), _line_material(1.5))
         add("triad", _triads(np.eye(4)[None], 0.05), _line_material(4))
         add("convergence", _ball(0.004, ACCENT), _plain())
@@ -342,10 +344,10 @@ class AnnotationWindow:
 
     def _draw_ghosts(self, sphere: PrecisionSphere) -> None:
         scene, demonstration = self._view.scene, self._session.demonstration
-        gripper = ghost_gripper(demonstration, sphere)
+        gripper = ghost_gripper(demonstration, sphere.waypoint)
         if gripper != self._ghost_gripper:
             tool = open3d.geometry.TriangleMesh()
-            for mesh in ghost_meshes(self._robot, demonstration, sphere):
+            for mesh in ghost_meshes(self._robot, demonstration, sphere.waypoint):
                 tool += _shaded(mesh, np.eye(4))
             tool.paint_uniform_color(FAINT)
             tool = _textured(tool)
@@ -434,8 +436,7 @@ class _Panel:
         self._verdict.text = textwrap.fill(session.state()["verdict"], 40)
         colour = INK if here is None else COLOURS[session.verdict(here).word]
         self._verdict.text_color = gui.Color(*colour)
-        unsaved = ", not saved" if session.dirty else ""
-        self._head.text = f"{len(session.spheres)} spheres{unsaved}"
+        self._head.text = heading_of(session)
         # As many as there is room for, those about the selected waypoint among them.
         before = sum(s.waypoint <= session.selected for s in session.spheres)
         first = max(0, min(before - _ROWS // 2, len(session.spheres) - _ROWS))
@@ -446,7 +447,7 @@ class _Panel:
                 mark, radius = ">" if sphere is here else " ", 1e3 * sphere.radius
                 label.text = f"{mark}{sphere.waypoint:>4} {radius:>6.1f} mm  {word}"
                 label.text_color = gui.Color(*COLOURS[word])
-        self._message.text = session.message or "A suggests all spheres, Enter adds one here"
+        self._message.text = message_of(session)
         self._window.set_needs_layout()
 
     def layout(self, area: Any) -> Any:

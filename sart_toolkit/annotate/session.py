@@ -18,7 +18,6 @@ import numpy as np
 from sart_toolkit.annotate.suggest import (
     SuggestConfig,
     Suggestion,
-    proved_radius,
     suggest_annotation,
     suggest_radius,
     suggestion_settings,
@@ -205,10 +204,8 @@ class AnnotationSession:
     @functools.cached_property
     def clearances(self) -> Array:
         """How far `(T,)` [m] the tool was from the nearest obstacle at each waypoint."""
-        # The nearest pair is named where a radius as small as this fits.
-        config = SuggestConfig(margin=1e-6, min_radius=1e-6, max_radius=1e-6)
-        found = [proved_radius(self._world, t, config).clearance for t in range(self.last + 1)]
-        return np.array([np.inf if x is None else x for x in found])
+        joints = self.demonstration.steps.joint_positions
+        return np.array([self._world.tool_clearance(t, q) for t, q in enumerate(joints)])
 
     def ghosts(self, sphere: PrecisionSphere) -> Array:
         """A few tool poses `(n, 4, 4)` as the augmentation would draw them; always the same."""

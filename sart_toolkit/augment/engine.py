@@ -28,6 +28,10 @@ from sart_toolkit.workers.parcels import Output
 _log = logging.getLogger(__name__)
 
 
+Watch = Callable[[AttemptKey, str], None]
+"""Called with each attempt's key and outcome, those before an interruption first."""
+
+
 class _Result(NamedTuple):
     """What came of an attempt, small enough to go from one process to another.
 
@@ -102,11 +106,12 @@ def augment_demonstration(
     progress: Callable[[int, int, int], None] | None = None,
     ask: Callable[[str], None] | None = None,
     task: Task | None = None,
+    watch: Watch | None = None,
 ) -> Dataset:
     """Generate a dataset directory from one demonstration: `augment_sources` of that alone."""
     sources = [(demonstration, annotation)]
     return augment_sources(
-        sources, make_backend, out, config, workers, overwrite, progress, ask, task
+        sources, make_backend, out, config, workers, overwrite, progress, ask, task, watch
     )
 
 
@@ -120,6 +125,7 @@ def augment_sources(
     progress: Callable[[int, int, int], None] | None = None,
     ask: Callable[[str], None] | None = None,
     task: Task | None = None,
+    watch: Watch | None = None,
 ) -> Dataset:
     """Generate a dataset directory from demonstrations of one task and their annotations.
 
@@ -140,6 +146,8 @@ def augment_sources(
         task: what the demonstrations show. Given, and where states can be restored, trajectories
             that begin with something grasped are executed to the end and kept if they reach the
             goal.
+        watch: called in this process with each attempt's key and its outcome, "kept" or why it was
+            rejected; once `out` holds what came of it, and of those before an interruption first.
 
     Raises:
         Mismatch: an annotation belongs to another demonstration, the demonstrations to different
@@ -190,7 +198,7 @@ def augment_sources(
                 return run(keys)
 
         resumed = writer.n_kept + writer.n_rejected > 0
-        resets = _generate(writer, allocation, make, progress)
+        resets = _generate(writer, allocation, make, progress, watch)
         # How long an interrupted generation took in all, with how many resets, is not known.
         seconds, counted = (None, None) if resumed else (time.perf_counter() - started, resets)
         return _finish(writer, sources[0][0], config, allocation.shares, seconds, counted)
@@ -201,6 +209,7 @@ def _generate(
     allocation: Allocation,
     make: Callable[[Iterable[AttemptKey], Spare], Iterator[_Result]],
     progress: Callable[[int, int, int], None] | None,
+    watch: Watch | None,
 ) -> int:
     """Have attempts made until no more are needed or none are left; how many resets they took."""
     given: set[AttemptKey] = set()
@@ -213,6 +222,9 @@ def _generate(
                 return key
         return None
 
+    if watch is not None:
+        for key, outcome in writer.outcomes():
+            watch(key, outcome)
     resets = 0
     while keys := allocation.missing(writer.tally):
         given.clear()
@@ -223,6 +235,8 @@ def _generate(
                 writer.reject(key, rejection)
             else:
                 writer.keep(entry)
+            if watch is not None:
+                watch(key, rejection.outcome)
             if progress is not None:
                 progress(writer.n_kept, allocation.wanted, writer.n_rejected)
     return resets

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sart_toolkit.augment import get_strategy
@@ -12,8 +14,9 @@ from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.collision.phases import BODY_STILLNESS, OUT_AND_BACK_STILLNESS
 from sart_toolkit.collision.world import CollisionWorld
+from sart_toolkit.data.manifest import AttemptKey
 from sart_toolkit.data.pace import Pace
-from sart_toolkit.data.records import Annotation, Demonstration
+from sart_toolkit.data.records import Annotation, Demonstration, PrecisionSphere
 from sart_toolkit.errors import MotionRejected, Unreachable
 from sart_toolkit.motion.controller import settling_targets
 from sart_toolkit.motion.line import straight_line
@@ -57,14 +60,9 @@ class SegmentPlanner:
         self._approach_proofs: dict[tuple[int, float], Certificate] = {}
 
     def proposal(self, sphere: int, k: int) -> tuple[Proposal, np.random.Generator]:
-        """The k-th draw from a sphere, and the random numbers that follow.
-
-        Their seed is (seed, sphere, k, source).
-        """
-        rng = np.random.default_rng([self._config.seed, sphere, k, self._source])
-        strategy = get_strategy(self._config.strategy)
-        demonstration, sampling = self.world.demonstration, self._config.sampling
-        return strategy.propose(demonstration, self._spheres, sphere, rng, sampling), rng
+        """The k-th draw from a sphere, and the random numbers that follow."""
+        key = AttemptKey(self._source, sphere, k)
+        return draw_proposal(self.world.demonstration, self._spheres, key, self._config)
 
     @property
     def stillness(self) -> float:
@@ -167,6 +165,27 @@ class SegmentPlanner:
                 record_hz=record_hz,
             )
         return motion, min(certificate, approach, key=lambda proof: proof.clearance)
+
+
+def draw_proposal(
+    demonstration: Demonstration,
+    spheres: Sequence[PrecisionSphere],
+    key: AttemptKey,
+    config: AugmentConfig,
+) -> tuple[Proposal, np.random.Generator]:
+    """What is drawn for an attempt, and the random numbers that follow.
+
+    Their seed is (seed, sphere, k, source), so that it is the same wherever it is drawn.
+
+    Args:
+        demonstration: the attempt's source.
+        spheres: what the strategy draws from there.
+        key: the attempt.
+        config: how poses are drawn.
+    """
+    rng = np.random.default_rng([config.seed, key.sphere, key.k, key.source])
+    strategy = get_strategy(config.strategy)
+    return strategy.propose(demonstration, spheres, key.sphere, rng, config.sampling), rng
 
 
 def world_of(

@@ -295,11 +295,20 @@ class Record:
     json: _JSON = False
 
 
+_WEB = Annotated[bool, arg(help="In a browser, also another computer's over ssh.")]
+_HOST = Annotated[
+    str | None, _optional("ADDRESS", "Where --web is reached; 127.0.0.1, this computer only.")
+]
+_PORT = Annotated[int | None, _optional("PORT", "Port of --web; 8080.")]
+
+
 @dataclass(frozen=True)
 class Play:
-    """Look at a demonstration or an episode again, in a window or as an MP4 video.
+    """Look at a demonstration or an episode again, in a window, a browser or as an MP4 video.
 
     Example: sart play demo.h5
+
+    Example: sart play dataset/episodes/demo00/sphere00_k00000.h5 --web
 
     Example: sart play dataset/episodes/demo00/sphere00_k00000.h5 --out episode.mp4
 
@@ -312,9 +321,17 @@ class Play:
     out: Annotated[
         Path | None, _optional("PATH", "MP4 file to write; shown in a window if left out.")
     ] = None
+    web: _WEB = False
+    host: _HOST = None
+    port: _PORT = None
     camera: Annotated[
-        str, arg(help="A camera of the scene, drawn again; or a recorded one, such as wrist.")
-    ] = "overview"
+        str | None,
+        _optional(
+            "CAMERA",
+            "A camera of the scene, drawn again, or a recorded one, such as wrist; overview if "
+            "left out. With --web: the recorded one that is shown beside the view.",
+        ),
+    ] = None
     speed: Annotated[float, arg(help="Playback speed; 1 is real time.")] = 1.0
     task: _NOTED_TASK = None
     robot: _NOTED_ROBOT = None
@@ -428,13 +445,6 @@ class Suggest:
     json: _JSON = False
 
 
-_WEB = Annotated[bool, arg(help="In a browser, also another computer's over ssh.")]
-_HOST = Annotated[
-    str | None, _optional("ADDRESS", "Where --web is reached; 127.0.0.1, this computer only.")
-]
-_PORT = Annotated[int | None, _optional("PORT", "Port of --web; 8080.")]
-
-
 @dataclass(frozen=True)
 class Annotate:
     """Annotate a demonstration with precision spheres: in a window, a browser, words, or headless.
@@ -500,6 +510,8 @@ class Augment:
     Example: sart augment demos/*.h5 annotations/*.json --out dataset --n 100
 
     Example: sart augment demos/*.h5 --out dataset --strategy bc
+
+    Example: sart augment demo.h5 annotation.json --out dataset --web
 
     Example: sart augment demo.h5 annotation.json --out plan.jsonl --dry-run
 
@@ -574,6 +586,11 @@ class Augment:
             "and proof, or why it would be rejected."
         ),
     ] = False
+    web: Annotated[
+        bool, arg(help="Show in a browser what is generated, as it comes; also over ssh.")
+    ] = False
+    host: _HOST = None
+    port: _PORT = None
     workers: _WORKERS = 1
     executor: _EXECUTOR = "processes"
     ray_address: _RAY_ADDRESS = None

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
 
 from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Augment, Validate
@@ -14,11 +15,17 @@ from sart_toolkit.cli.console import ProgressDisplay, say
 from sart_toolkit.cli.formats import check_verb
 from sart_toolkit.cli.info import describe_dataset
 from sart_toolkit.cli.sensor import declared_sensor
+from sart_toolkit.cli.web import check_web
 from sart_toolkit.cli.workers import chosen_workers
 from sart_toolkit.data.dataset import REPLAY
 from sart_toolkit.data.sampling import SamplingConfig
 from sart_toolkit.data.storage import check_writable
 from sart_toolkit.errors import InvalidInput, Mismatch
+
+if TYPE_CHECKING:
+    from sart_toolkit.augment.config import AugmentConfig
+    from sart_toolkit.augment.webview import GenerationView
+    from sart_toolkit.data.writer import Sources
 
 
 def augment_verb(args: Augment) -> dict[str, Any]:
@@ -27,6 +34,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
     demos = [path for path in args.files if path not in annotations]
     if not demos:
         raise InvalidInput("FILE: expected a demonstration, got annotations alone; add its .h5")
+    check_web(args, "--dry-run" if args.dry_run else "", needed=False)
     sensor = declared_sensor(args, demos)
     options: dict[str, Any] = {
         "task": args.task,
@@ -47,7 +55,7 @@ def augment_verb(args: Augment) -> dict[str, Any]:
         "obstacles": args.source,
         "seed": args.seed,
     }
-    with ProgressDisplay() as progress:
+    with ExitStack() as stack, ProgressDisplay() as progress:
         if args.dry_run:
             planned = pipeline.preview(demos, annotations, args.out, progress=progress, **options)
             return {"plan": str(args.out), **dataclasses.asdict(planned)}
@@ -57,9 +65,27 @@ def augment_verb(args: Augment) -> dict[str, Any]:
             args.out,
             progress=progress,
             ask=_ask if sys.stdin.isatty() else None,
+            watch=_watch_on_page(args, stack) if args.web else None,
             **options,
         )
     return {"dataset": str(args.out), **describe_dataset(dataset)}
+
+
+def _watch_on_page(
+    args: Augment, stack: ExitStack
+) -> Callable[[Sources, AugmentConfig], GenerationView]:
+    """Opens the page of --web, which is closed with the stack."""
+
+    def opened(sources: Sources, config: AugmentConfig) -> GenerationView:
+        from sart_toolkit.augment.webview import GenerationView
+
+        robot, scene = pipeline.setting_of(sources[0][0], args.task, args.robot)
+        view = GenerationView(sources, config, robot, scene, args.out, args.host, args.port)
+        if view.how_to_open:
+            say(view.how_to_open)
+        return stack.enter_context(view)
+
+    return opened
 
 
 def _ask(text: str) -> None:

@@ -1,4 +1,4 @@
-"""`sart play`: which recording a path names, and window or video."""
+"""`sart play`: which recording a path names, and window, page or video."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from sart_toolkit import pipeline
 from sart_toolkit.cli.arguments import Play
-from sart_toolkit.cli.console import ProgressDisplay
+from sart_toolkit.cli.console import ProgressDisplay, say
+from sart_toolkit.cli.web import check_web
 from sart_toolkit.data.records import Demonstration
 from sart_toolkit.data.storage import (
     OutputLock,
@@ -16,11 +17,14 @@ from sart_toolkit.data.storage import (
     load_demonstration,
     load_recording,
 )
-from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile
+from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, unknown_name
 from sart_toolkit.poses import check_positive
 
 if TYPE_CHECKING:
     from sart_toolkit.report.player import Playback, SceneView
+
+# The camera of the scene whose view is drawn if no other is asked for.
+_OUTSIDE = "overview"
 
 
 def play_verb(args: Play) -> dict[str, Any]:
@@ -29,8 +33,11 @@ def play_verb(args: Play) -> dict[str, Any]:
     check_play_options(args)
     playback = load_playback(args.file)
     demonstration = playback.demonstration
-    if args.camera in demonstration.steps.cameras:
-        playback.camera = args.camera
+    if args.web:
+        return _web_mode(args, playback)
+    camera = args.camera or _OUTSIDE
+    if camera in demonstration.steps.cameras:
+        playback.camera = camera
         return play(args, playback, None)
     from sart_toolkit.report.player import SceneView
 
@@ -39,7 +46,7 @@ def play_verb(args: Play) -> dict[str, Any]:
         demonstration, size, demonstration.rates, args.task, args.robot, args.backend
     )
     with closing(make()) as backend:
-        return play(args, playback, SceneView(playback, backend, args.camera))
+        return play(args, playback, SceneView(playback, backend, camera))
 
 
 def load_playback(path: Path) -> Playback:
@@ -85,9 +92,12 @@ def check_play_options(args: Play) -> None:
     """Refuse what can't be done before anything is drawn.
 
     Raises:
-        InvalidInput: the speed is not positive, or the video's name doesn't end in .mp4.
+        InvalidInput: the speed is not positive, the video's name doesn't end in .mp4, or an option
+            is about something else than what is asked for.
         OutputExists, CannotWrite: the video can't be written.
+        MissingExtra: a page is asked for, and viser isn't installed.
     """
+    check_web(args, "--out" if args.out else "--backend" if args.backend else "")
     check_positive("speed", args.speed)
     if args.out is not None:
         if args.out.suffix.lower() != ".mp4":
@@ -95,15 +105,36 @@ def check_play_options(args: Play) -> None:
         check_writable(args.out, args.overwrite)
 
 
-def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, Any]:
-    """What was played: in a window until it was closed, or into a video."""
-    said = {
+def _web_mode(args: Play, playback: Playback) -> dict[str, Any]:
+    """What was played on a page until it was closed."""
+    demonstration = playback.demonstration
+    if args.camera is not None:
+        # The view from outside can be turned: no camera of the scene is needed.
+        if args.camera not in demonstration.steps.cameras:
+            raise unknown_name("recorded camera", args.camera, demonstration.steps.cameras)
+        playback.camera = args.camera
+    from sart_toolkit.report.webplayer import play_in_browser
+
+    robot, scene = pipeline.setting_of(demonstration, args.task, args.robot)
+    known = all(body.name in demonstration.body_Ts_world for body in scene.bodies)
+    world = pipeline.world_of(demonstration, task=args.task, robot=args.robot) if known else None
+    play_in_browser(playback, robot, scene, world, args.speed, args.host, args.port, say)
+    return _played(args, playback)
+
+
+def _played(args: Play, playback: Playback) -> dict[str, Any]:
+    return {
         "played": str(args.file),
         "kind": "episode" if playback.split else "demonstration",
         "task": playback.demonstration.task,
         "steps": len(playback),
         "seconds": playback.seconds,
     }
+
+
+def play(args: Play, playback: Playback, scene: SceneView | None) -> dict[str, Any]:
+    """What was played: in a window until it was closed, or into a video."""
+    said = _played(args, playback)
     if args.out is None:
         from sart_toolkit.record.screen import Screen
         from sart_toolkit.report.player import PlayWindow

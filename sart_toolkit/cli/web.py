@@ -19,12 +19,14 @@ class Served(Protocol):
     def port(self) -> int | None: ...
 
 
-def check_web(args: Served, instead: str) -> None:
+def check_web(args: Served, instead: str, needed: bool = True) -> None:
     """Refuse what can't be served, before anything is read.
 
     Args:
         args: the verb's options.
         instead: the option given that asks for something else than a page, if any.
+        needed: whether the page is what the verb is for; else it goes on where the address can't be
+            had.
 
     Raises:
         InvalidInput: options that exclude each other, or an address that can't be had.
@@ -37,4 +39,6 @@ def check_web(args: Served, instead: str) -> None:
         return
     if instead:
         raise InvalidInput(f"--web and {instead}: choose one of them")
-    importlib.import_module("sart_toolkit.record.webpage").check_port(args.host, args.port)
+    webpage = importlib.import_module("sart_toolkit.record.webpage")
+    if needed:
+        webpage.check_port(args.host, args.port)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import numpy as np
+
 from sart_toolkit.collision.certificate import Certificate, JointPath, certify
 from sart_toolkit.collision.model import PlacedModel
 from sart_toolkit.collision.phases import (
@@ -100,6 +102,14 @@ class CollisionWorld(ABC):
             raise MotionRejected(
                 f"{unknown}: nothing can be proved at waypoint {t}; choose other waypoints"
             )
+
+    def tool_clearance(self, t: int, q: Array) -> float:
+        """How far [m] the tool is from the nearest obstacle of waypoint `t` at joints `q (n,)`.
+
+        Infinite where there is none.
+        """
+        placed = self.placed(t)
+        return float(min(placed.pair_distances(q, placed.tool_pairs()), default=np.inf))
 
     def too_close(self, t: int, q: Array, margin: float) -> str | None:
         """The names of the nearest pair at joints `q (n,)` if it is nearer than the margin [m].

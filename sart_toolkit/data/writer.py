@@ -19,6 +19,7 @@ from sart_toolkit.data.dataset import (
     manifest_sources,
 )
 from sart_toolkit.data.manifest import (
+    KEPT,
     AttemptKey,
     AttemptTally,
     EpisodeEntry,
@@ -255,6 +256,11 @@ class DatasetWriter:
     def n_rejected(self) -> int:
         """How many attempts gave no episode so far."""
         return len(self._manifest.rejected)
+
+    def outcomes(self) -> list[tuple[AttemptKey, str]]:
+        """The attempts so far, each with `KEPT` or why it gave no episode."""
+        kept = [(key, KEPT) for key in self._manifest.kept]
+        return kept + [(key, found.outcome) for key, found in self._manifest.rejected.items()]
 
     @property
     def executed_seconds(self) -> float | None:

@@ -5,23 +5,30 @@ The only module that imports viser; it is imported where a page is asked for.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import getpass
+import html
 import io
+import ipaddress
 import queue
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Self
+from urllib.parse import urlsplit
 
 import numpy as np
+from PIL import Image as PillowImage
 from scipy.spatial.transform import Rotation
 
-from sart_toolkit.errors import InvalidInput, MissingExtra
+from sart_toolkit.data.records import Image
+from sart_toolkit.errors import InvalidInput, MissingCapability, MissingExtra
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.visuals import DrawnMesh
 
 try:
     import viser
+    import websockets.asyncio.server
 except ModuleNotFoundError as error:
     raise MissingExtra(
         "the page in a browser needs viser: pip install 'sart_toolkit[web]', or work without --web"
@@ -67,6 +74,16 @@ if (!window.ownKeys) {{
 }}
 ">{css}</style>"""
 
+# What our panels are made of.
+_PANEL = """
+.sart { font-size: 13px; line-height: 1.45; padding: 2px 8px; }
+.sart .message { background: #21262f; color: #fff; border-radius: 4px; padding: 6px 9px; }
+.sart .now { display: flex; align-items: flex-start; gap: 10px; margin: 8px 0; }
+.sart img { flex: none; width: 144px; height: auto; border-radius: 4px; }
+.sart td { vertical-align: top; padding: 0 8px 0 0; }
+.sart td:first-child { color: #6b7380; }
+@media (max-width: 36em) { .sart img { width: 96px; } }
+"""
 # On a telephone viser's panel is a sheet at the bottom, neither wide enough nor low enough.
 _NARROW = """
 @media (max-width: 36em) {
@@ -95,14 +112,13 @@ class WebPage:
 
         Raises:
             InvalidInput: the address isn't this computer's, or the port is taken.
+            MissingCapability: this version of viser can't be kept from answering other pages.
         """
         self._host, self._port = host or HOST, PORT if port is None else port
         check_port(host, port)
         self._view = np.array([1.0, -1.0, 1.0]), np.zeros(3)
         self._inputs: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
-        # What it prints would stand among results.
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server = viser.ViserServer(self._host, self._port, label=title, verbose=False)
+        self.server = _open_server(self._host, self._port, title)
         self.url = f"http://{self._host}:{self._port}"
         gui, scene = self.server.gui, self.server.scene
         gui.configure_theme(
@@ -113,7 +129,7 @@ class WebPage:
         )
         scene.configure_default_lights(cast_shadow=False)
         scene.set_background_image(np.full((1, 1, 3), _BACKGROUND, np.uint8), "png")
-        gui.add_html(_STYLE.format(title=title, css=_NARROW + css, let_go=_LET_GO))
+        gui.add_html(_STYLE.format(title=title, css=_PANEL + _NARROW + css, let_go=_LET_GO))
         self.add_key(_LET_GO, LET_GO, "what was dragged or typed counts")
         self.server.on_client_connect(self._aim)
 
@@ -165,6 +181,11 @@ class WebPage:
     def waiting(self) -> bool:
         """Whether something was done that isn't taken yet."""
         return not self._inputs.empty()
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser has it open."""
+        return bool(self.server.get_clients())
 
     def put(self, name: str, value: Any = None) -> None:
         """Have an input taken; from any thread."""
@@ -233,6 +254,113 @@ class WebPage:
             eye, at = at + back - down, at - down
         with client.atomic():
             camera.position, camera.look_at = eye, at
+
+
+def _open_server(host: str, port: int, title: str) -> Any:
+    """viser's server, answering no page but its own.
+
+    viser lets whatever page asks connect; a browser says which page does. The one place to refuse
+    it before anything is said is where the connection is opened, which viser leaves to websockets.
+
+    Raises:
+        MissingCapability: this version of viser opens it otherwise.
+    """
+    module: Any = websockets.asyncio.server
+    serve = module.serve
+    guarded = False
+
+    def guarded_serve(*args: Any, process_request: Any, **options: Any) -> Any:
+        nonlocal guarded
+        guarded = True
+
+        def checked(connection: Any, request: Any) -> Any:
+            if not asks_itself(request.headers.get("Host"), request.headers.get("Origin"), host):
+                return connection.respond(403, _REFUSED)
+            return process_request(connection, request)
+
+        return serve(*args, process_request=checked, **options)
+
+    module.serve = guarded_serve
+    try:
+        # What it prints would stand among results.
+        with contextlib.redirect_stdout(io.StringIO()):
+            server = viser.ViserServer(host, port, label=title, verbose=False)
+    finally:
+        module.serve = serve
+    if not guarded:
+        server.stop()
+        raise MissingCapability(
+            f"viser {viser.__version__}: other web pages can't be kept from its port; pip install "
+            "'viser==1.1.1'"
+        )
+    return server
+
+
+_REFUSED = (
+    "Refused: another web page asked, or this computer was called by a name that it doesn't know. "
+    "Open the page by its address, or start it with --host NAME.\n"
+)
+
+
+def asks_itself(host: str | None, origin: str | None, served: str) -> bool:
+    """Whether a request comes from the page that is asked, or from no page at all.
+
+    Without the second condition a page anywhere could have its own name lead here.
+
+    Args:
+        host: what the browser takes this server for, name and port.
+        origin: the page that asks, as browsers say it; programs other than browsers say none.
+        served: the address that is served, which may be a name.
+    """
+    if host is None or (origin is not None and urlsplit(origin).netloc != host):
+        return False
+    name = urlsplit(f"//{host}").hostname or ""
+    if name in ("localhost", served.lower(), socket.gethostname().lower()):
+        return True
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def panel(*parts: str) -> str:
+    """HTML in the style of our panels."""
+    return f'<div class="sart">{"".join(parts)}</div>'
+
+
+def message(text: str) -> str:
+    """Words that stand out, as HTML."""
+    return f'<div class="message">{html.escape(text)}</div>'
+
+
+def facts(lines: Mapping[str, str] | Iterable[Sequence[str]]) -> str:
+    """Names and what is to be said of each, as an HTML table."""
+    rows = lines.items() if isinstance(lines, Mapping) else lines
+    cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows)
+    return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+
+
+def beside(image: Image | None, text: str) -> str:
+    """An image `(H, W, 3)` uint8, if there is one, and HTML to the right of it."""
+    shown = ""
+    if image is not None:
+        data = io.BytesIO()
+        PillowImage.fromarray(image).save(data, "PNG")
+        shown = f'<img src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+    return f'<div class="now">{shown}{text}</div>'
+
+
+def coloured(text: str, colour: Sequence[float]) -> str:
+    """Words in a colour, in [0, 1], as HTML."""
+    r, g, b = to_bytes(colour)
+    return f'<span style="color:rgb({r},{g},{b})">{html.escape(text)}</span>'
+
+
+def to_bytes(colour: Sequence[float]) -> tuple[int, int, int]:
+    """A colour in [0, 1] as viser takes it."""
+    r, g, b = (round(255 * value) for value in colour)
+    return r, g, b
 
 
 def place(node: Any, T: Array) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal
 
 import numpy as np
 
 from sart_toolkit.backends.interface import Backend, Draws, require
-from sart_toolkit.collision.phases import demonstration_phases
+from sart_toolkit.collision.phases import Phase, demonstration_phases
+from sart_toolkit.collision.world import CollisionWorld
 from sart_toolkit.data.records import Demonstration, Episode, Image
 from sart_toolkit.errors import InvalidInput, unknown_name
 from sart_toolkit.poses import Array, check_positive, inverse
@@ -35,6 +36,8 @@ FILM_SIZE = 480
 _WINDOW_SIZE = 448
 # Images of the scene kept in the window, so that stepping to and fro is quick.
 _KEPT = 120
+# How long [s] a stopped player waits for something to do.
+_IDLE = 0.5
 
 
 class Playback:
@@ -121,13 +124,27 @@ class Playback:
         steps, t = self._parts[i]
         return steps.joint_positions[t], steps.measured_Ts_world_tool[t]
 
+    def bodies(self, i: int, phases: Sequence[Phase]) -> dict[str, Array]:
+        """Where the scene's bodies were at step `i` `(4, 4)`, as far as the demonstration tells.
+
+        Through an episode's segment they are where the demonstration had them at the waypoint that
+        it joins, and what is grasped there, as the demonstration's `phases` say, moves with the
+        tool.
+        """
+        t, demonstration = self.waypoint(i), self.demonstration
+        Ts = {name: poses[t] for name, poses in demonstration.body_Ts_world.items()}
+        T_then = demonstration.steps.measured_Ts_world_tool[t]
+        T_moved = self.joints(i)[1] @ inverse(T_then)
+        return {name: T_moved @ T if name in phases[t].grasped else T for name, T in Ts.items()}
+
+    def clearances(self, world: CollisionWorld) -> Array:
+        """How far `(n,)` [m] the tool was from the nearest obstacle at each step."""
+        steps = range(len(self))
+        return np.array([world.tool_clearance(self.waypoint(i), self.joints(i)[0]) for i in steps])
+
 
 class SceneView:
-    """Draws the scene from outside as it was at each step, from recorded joints and bodies.
-
-    Through an episode's segment the bodies are where the demonstration had them at the waypoint
-    that it joins, and what is grasped moves with the tool.
-    """
+    """Draws the scene from outside as it was at each step, from recorded joints and bodies."""
 
     def __init__(self, playback: Playback, backend: Backend, camera: str) -> None:
         """Draw with a backend of the demonstration's robot and scene.
@@ -160,13 +177,9 @@ class SceneView:
 
     def _state(self, i: int) -> SceneState:
         playback, scene = self._playback, self._scene
-        demonstration, t = playback.demonstration, playback.waypoint(i)
-        Ts = {body.name: demonstration.body_Ts_world[body.name][t] for body in scene.bodies}
-        q, T_world_tool = playback.joints(i)
-        T_moved = T_world_tool @ inverse(demonstration.steps.measured_Ts_world_tool[t])
-        for name in self._phases[t].grasped:
-            Ts[name] = T_moved @ Ts[name]
-        return scene.seen_state(q, playback.gripper(i)[0], Ts)
+        Ts = playback.bodies(i, self._phases)
+        known = {body.name: Ts[body.name] for body in scene.bodies}
+        return scene.seen_state(playback.joints(i)[0], playback.gripper(i)[0], known)
 
 
 def film(playback: Playback, scene: SceneView | None) -> Iterator[Image]:
@@ -195,13 +208,86 @@ def _facts(playback: Playback, i: int) -> str:
     return f"{playback.part(i)} · gripper {playback.gripper(i)[0]:.2f}{force_text}{reached}"
 
 
-class PlayWindow:
-    """Shows a playback in a window until it is closed.
+class Player:
+    """At which step a playback is, and whether it moves on by itself.
 
     Attributes:
         at: the step shown.
         playing: whether it moves on by itself.
+        closed: whether the person has left.
     """
+
+    def __init__(
+        self,
+        playback: Playback,
+        speed: float = 1.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Begin to play at the first step.
+
+        Args:
+            playback: what is shown.
+            speed: times real time.
+            clock: returns the time [s].
+
+        Raises:
+            InvalidInput: the speed is not positive.
+        """
+        self._period = 1.0 / (playback.hz * check_positive("speed", speed))
+        self._playback, self._speed, self._clock = playback, speed, clock
+        self.at, self.playing = 0, True
+        self.closed = False
+        self._due = clock() + self._period
+
+    @property
+    def pace(self) -> str:
+        """How fast it plays, in words."""
+        return "in real time" if self._speed == 1 else f"{self._speed:g} times real time"
+
+    @property
+    def wait(self) -> float:
+        """How long [s] nothing is to be done."""
+        return max(0.0, self._due - self._clock()) if self.playing else _IDLE
+
+    def advance(self) -> None:
+        """Go one step forward if it is time to."""
+        if self.playing and self._clock() >= self._due:
+            self.step(1)
+            # Where drawing takes longer than a step, no step is left out.
+            self._due = max(self._due + self._period, self._clock())
+
+    def key(self, name: str) -> None:
+        """Do what a key means, by pygame's name of it."""
+        last = len(self._playback) - 1
+        match name:
+            case "space":
+                if not self.playing and self.at == last:
+                    self.at = 0
+                self.playing = not self.playing
+            case "right" | "left":
+                self.playing = False
+                self.step(1 if name == "right" else -1)
+            case "home" | "end":
+                self.go(0 if name == "home" else last)
+            case "escape":
+                self.closed = True
+        self._due = self._clock() + self._period
+
+    def go(self, i: int) -> None:
+        """Stop at a step, or the nearest that there is."""
+        self.playing = False
+        self.at = min(max(i, 0), len(self._playback) - 1)
+
+    def step(self, by: int) -> None:
+        """Go forward, or back, by a number of steps, as far as there are any."""
+        last = len(self._playback) - 1
+        self.at = min(max(self.at + by, 0), last)
+        if self.playing and self.at == last:
+            self.playing = False
+
+
+class PlayWindow(Player):
+    """Shows a playback in a window until it is closed."""
 
     def __init__(
         self,
@@ -223,16 +309,12 @@ class PlayWindow:
         Raises:
             InvalidInput: the speed is not positive.
         """
-        self._period = 1.0 / (playback.hz * check_positive("speed", speed))
-        self._playback, self._scene, self._screen = playback, scene, screen
-        self._speed, self._clock = speed, clock
+        super().__init__(playback, speed, clock)
+        self._scene, self._screen = scene, screen
         self._kept: OrderedDict[int, Image] = OrderedDict()
-        self.at, self.playing = 0, True
-        self.closed = False
 
     def run(self) -> None:
         """Play until the window is closed."""
-        due = self._clock()
         drawn = None
         while not self.closed:
             for event in self._screen.events():
@@ -240,40 +322,12 @@ class PlayWindow:
                     self.closed = True
                 elif isinstance(event, Key) and event.down:
                     self.key(event.name)
-                    due = self._clock() + self._period
-            if self.playing and self._clock() >= due:
-                self.step(1)
-                # Where drawing takes longer than a step, no step is left out.
-                due = max(due + self._period, self._clock())
+            self.advance()
             if drawn != (self.at, self.playing):
                 self.draw()
                 drawn = (self.at, self.playing)
             else:
                 time.sleep(0.005)
-
-    def key(self, name: str) -> None:
-        """Do what a key means, by pygame's name of it."""
-        last = len(self._playback) - 1
-        match name:
-            case "space":
-                if not self.playing and self.at == last:
-                    self.at = 0
-                self.playing = not self.playing
-            case "right" | "left":
-                self.playing = False
-                self.step(1 if name == "right" else -1)
-            case "home" | "end":
-                self.playing = False
-                self.at = 0 if name == "home" else last
-            case "escape":
-                self.closed = True
-
-    def step(self, by: int) -> None:
-        """Go forward, or back, by a number of steps, as far as there are any."""
-        last = len(self._playback) - 1
-        self.at = min(max(self.at + by, 0), last)
-        if self.playing and self.at == last:
-            self.playing = False
 
     def _scene_image(self) -> Image:
         i = self.at
@@ -322,12 +376,7 @@ class PlayWindow:
         for row, (keys, what) in enumerate(rows):
             screen.text((768, 496 + 30 * row), keys, 15, BRIGHT, bold=True)
             screen.text((880, 496 + 30 * row), what, 15, TEXT)
-        screen.text(
-            (768, 704),
-            "in real time" if self._speed == 1 else f"{self._speed:g} times real time",
-            13,
-            FAINT,
-        )
+        screen.text((768, 704), self.pace, 13, FAINT)
         self._timeline()
         screen.show()
 

@@ -25,6 +25,8 @@ _FLAGS = (
     "--headless=new", "--no-sandbox", "--remote-debugging-port=0", "--hide-scrollbars",
     "--no-first-run", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist",
 )  # fmt: skip
+# What stands at the top of the panels of the toolkit's pages.
+MESSAGE = ".sart .message"
 _CENTRE = """(() => {
   const found = Array.from(document.querySelectorAll(%s)).filter(e => %s)[%d];
   if (!found) return null;
@@ -100,6 +102,11 @@ class Browser:
     def open(self, url: str) -> None:
         """Go to a page."""
         self.call("Page.navigate", url=url)
+
+    def open_page(self, url: str) -> None:
+        """Go to one of the toolkit's own pages, and wait until its panel says something."""
+        self.open(url)
+        self.wait_for(f"!!document.querySelector('{MESSAGE}')")
 
     def run(self, script: str) -> Any:
         """The value of a JavaScript expression."""

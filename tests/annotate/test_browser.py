@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import importlib
 import json
 import re
@@ -11,27 +11,17 @@ import socket
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from sart_toolkit.annotate.session import ACTIONS, KEYS
 from sart_toolkit.cli import main
 from sart_toolkit.data.storage import load_annotation, save_demonstration
-from sart_toolkit.errors import InvalidInput, MissingExtra
-from sart_toolkit.testing.browser import Browser, find_browser
+from sart_toolkit.testing.browser import MESSAGE
 
-SART = [sys.executable, "-c", "from sart_toolkit.cli import main; main()", "annotate"]
 JS_NAMES = {
     "Right": "ArrowRight", "Left": "ArrowLeft", "Up": "ArrowUp", "Down": "ArrowDown",
     "Page Down": "PageDown", "Page Up": "PageUp", "Space": " ",
 }  # fmt: skip
-MESSAGE = ".sart .message"
-
-
-@pytest.fixture
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        return found.getsockname()[1]
 
 
 @pytest.fixture
@@ -41,42 +31,13 @@ def demo(tmp_path, peg_demonstration):
 
 
 @pytest.fixture
-def serve(demo, free_port):
+def annotate(demo, serve):
     """Starts `sart annotate --web`; the program, once it has said where its page is."""
-    pytest.importorskip("viser")
-    programs = []
-
-    def started(*options):
-        program = subprocess.Popen(
-            [*SART, str(demo), "--web", "--port", str(free_port), "--json", *options],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        programs.append(program)
-        program.said = next(line for line in program.stderr if "ssh" in line)
-        program.url = f"http://127.0.0.1:{free_port}"
-        return program
-
-    yield started
-    for program in programs:
-        with contextlib.suppress(ProcessLookupError):
-            program.kill()
-        program.communicate()
-
-
-@pytest.fixture
-def browser():
-    try:
-        find_browser()
-    except MissingExtra as error:
-        pytest.skip(str(error))
-    pytest.importorskip("viser")
-    with Browser(1400, 1200) as browser:
-        yield browser
+    return functools.partial(serve, "annotate", demo)
 
 
 def opened(browser, program):
-    browser.open(program.url)
-    browser.wait_for(f"!!document.querySelector('{MESSAGE}')")
+    browser.open_page(program.url)
     # Keys are listened to once the page has been drawn.
     browser.wait_for("!!document.querySelector('button')")
 
@@ -103,8 +64,8 @@ def ended(program):
 
 
 @pytest.mark.window
-def test_three_keys_suggest_save_and_end(serve, browser, tmp_path, peg_annotation):
-    program = serve()
+def test_three_keys_suggest_save_and_end(annotate, browser, tmp_path, peg_annotation):
+    program = annotate()
     opened(browser, program)
     assert browser.run("document.title") == "sart annotate"
     browser.key("a")
@@ -121,8 +82,8 @@ def test_three_keys_suggest_save_and_end(serve, browser, tmp_path, peg_annotatio
 
 @pytest.mark.window
 @pytest.mark.slow
-def test_peg_in_hole_is_annotated_by_at_most_25_clicks(serve, browser, tmp_path):
-    program = serve()
+def test_peg_in_hole_is_annotated_by_at_most_25_clicks(annotate, browser, tmp_path):
+    program = annotate()
     opened(browser, program)
     clicks = 0
     while True:
@@ -151,8 +112,8 @@ def text_of_message():
 
 @pytest.mark.window
 @pytest.mark.slow
-def test_every_key_does_on_the_page_what_the_table_says(serve, browser, tmp_path, wait_until):
-    program = serve()
+def test_every_key_does_on_the_page_what_the_table_says(annotate, browser, tmp_path, wait_until):
+    program = annotate()
     opened(browser, program)
     browser.run("document.addEventListener('keydown', () => { window.leaked = true })")
     for key in ["A", *(key for key, name in KEYS.items() if name not in ("save", "quit"))]:
@@ -166,8 +127,8 @@ def test_every_key_does_on_the_page_what_the_table_says(serve, browser, tmp_path
 
 @pytest.mark.window
 @pytest.mark.slow
-def test_a_radius_that_is_dragged_is_one_change(serve, browser, tmp_path, wait_until):
-    program = serve("--suggest-all")
+def test_a_radius_that_is_dragged_is_one_change(annotate, browser, tmp_path, wait_until):
+    program = annotate("--suggest-all")
     opened(browser, program)
     before = len(rows(tmp_path))
     browser.drag(browser.centre("[role=slider]", index=1), (-60.0, 0.0), steps=4)
@@ -190,8 +151,8 @@ def test_a_radius_that_is_dragged_is_one_change(serve, browser, tmp_path, wait_u
 
 @pytest.mark.window
 @pytest.mark.slow
-def test_closing_the_browser_and_ctrl_c_lose_nothing(serve, browser, tmp_path, wait_until):
-    program = serve()
+def test_closing_the_browser_and_ctrl_c_lose_nothing(annotate, browser, tmp_path, wait_until):
+    program = annotate()
     assert re.search(r"ssh -N -L (\d+):127\.0\.0\.1:\1 \S+@\S+", program.said)
     opened(browser, program)
     browser.key("a")
@@ -207,7 +168,7 @@ def test_closing_the_browser_and_ctrl_c_lose_nothing(serve, browser, tmp_path, w
     assert len(rows(tmp_path)) == n == 2
     assert not (tmp_path / "demo.annotation.json").exists()
 
-    program = serve()
+    program = annotate()
     opened(browser, program)
     said(browser, "recovered the 1 key presses of an interrupted session; not saved yet")
     browser.key("q")
@@ -219,26 +180,6 @@ def test_every_action_with_keys_has_one_button():
     browser = importlib.import_module("sart_toolkit.annotate.browser")
     shown = [name for names in browser.BUTTONS.values() for name in names]
     assert sorted(shown) == sorted(name for name, action in ACTIONS.items() if action.keys)
-
-
-def test_of_values_of_a_slider_that_wait_only_the_last_is_taken(free_port):
-    pytest.importorskip("viser")
-    webpage = importlib.import_module("sart_toolkit.record.webpage")
-    with webpage.WebPage("a page", port=free_port) as page:
-        assert page.take(0.0) == []
-        for name, value in (("go", 1), ("go", 2), ("add", None), ("add", None), ("go", 3)):
-            page.put(name, value)
-        assert page.take(0.0) == [("go", 2), ("add", None), ("add", None), ("go", 3)]
-    with socket.create_server(("127.0.0.1", free_port)):
-        pass
-
-
-def test_rotations_are_in_the_order_of_viser():
-    pytest.importorskip("viser")
-    webpage = importlib.import_module("sart_toolkit.record.webpage")
-    quarter = np.eye(4)
-    quarter[:2, :2] = [[0, -1], [1, 0]]
-    assert np.allclose(webpage.wxyz(quarter), [np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
 
 
 def refused(capsys, *argv):
@@ -267,14 +208,6 @@ def test_a_port_that_is_taken_is_named_with_the_remedy(capsys, demo):
 )
 def test_options_that_exclude_each_other_are_refused(capsys, demo, options, said):
     assert said in refused(capsys, demo, *options)
-
-
-@pytest.mark.parametrize(("host", "port"), [("192.0.2.1", 8080), (None, 0), (None, 65536)])
-def test_addresses_that_cant_be_had_are_refused(host, port):
-    pytest.importorskip("viser")
-    webpage = importlib.import_module("sart_toolkit.record.webpage")
-    with pytest.raises(InvalidInput, match=r"192\.0\.2\.1:8080: can't serve|--port: expected 1 to"):
-        webpage.check_port(host, port)
 
 
 def test_without_viser_the_remedy_is_reported(monkeypatch, capsys, demo):
