@@ -37,6 +37,9 @@ from .backends.hardware import (
     cell_backend as cell_backend,
 )
 from .backends.interface import (
+    Attended as Attended,
+)
+from .backends.interface import (
     Backend as Backend,
 )
 from .backends.interface import (
@@ -50,6 +53,9 @@ from .backends.interface import (
 )
 from .backends.interface import (
     Draws as Draws,
+)
+from .backends.interface import (
+    Guides as Guides,
 )
 from .backends.interface import (
     KnowsBodies as KnowsBodies,

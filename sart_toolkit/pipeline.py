@@ -371,6 +371,9 @@ def record(
             made, found, model, found.initial_state(model, at), rng, frame, operator
         )
         steered = make_device(device, setup)
+        config = dataclasses.replace(config, guided=steered.guides)
+        if steered.guides and "frame" in by_hand:
+            raise InvalidInput("--frame: a hand moves the arm itself; leave it out")
         if steered.interactive:
             if steer is None:
                 raise InvalidInput(

@@ -21,7 +21,7 @@ from sart_toolkit.augment.execution import (
 from sart_toolkit.augment.executors import Attempt, SegmentExecutor, Spare, no_spare, rejected
 from sart_toolkit.augment.planner import SegmentPlanner
 from sart_toolkit.augment.strategies import Proposal
-from sart_toolkit.backends.interface import Backend, Resets, SensesContacts
+from sart_toolkit.backends.interface import Attended, Backend, Resets, SensesContacts
 from sart_toolkit.collision.certificate import Certificate
 from sart_toolkit.collision.phases import OUT_AND_BACK_STILLNESS
 from sart_toolkit.data.manifest import KEPT, AttemptKey
@@ -86,7 +86,8 @@ class ReplayExecutor(SegmentExecutor):
         ask: Callable[[str], None] | None = None,
         task: Task | None = None,
     ) -> None:
-        super().__init__(backend, sources, config, ask, task)
+        attendant = backend.ask if isinstance(backend, Attended) else ask
+        super().__init__(backend, sources, config, attendant, task)
         # How often what was measured at a waypoint didn't agree with the demonstration, and why.
         self._strayed: Counter[tuple[int, int]] = Counter()
         self._last_reason: dict[tuple[int, int], str] = {}
@@ -114,7 +115,7 @@ class ReplayExecutor(SegmentExecutor):
         if isinstance(backend, Resets):
             for demonstration in demonstrations:
                 start_state(demonstration, backend.scene)
-        elif ask is None:
+        elif ask is None and not isinstance(backend, Attended):
             raise MissingCapability(
                 f"backend {backend.name!r} lacks the ability Resets, and nobody can be asked to "
                 "put the scene back to the demonstration's start; type the command at a terminal, "

@@ -8,14 +8,16 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar, cast
 
 import numpy as np
 
 from sart_toolkit.backends.interface import (
+    Attended,
     Backend,
     CameraView,
     CommandSent,
+    Guides,
     Observation,
     SensesForce,
 )
@@ -23,7 +25,7 @@ from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.errors import InvalidInput, RobotStopped, SartError
 from sart_toolkit.hardware import DRIVERS
 from sart_toolkit.hardware.cell import Cell, load_cell
-from sart_toolkit.hardware.drivers import ArmState, Camera, Clock, Gripper
+from sart_toolkit.hardware.drivers import ArmState, Camera, Clock, Gripper, World
 from sart_toolkit.hardware.images import as_described
 from sart_toolkit.hardware.link import Inline, Link, OwnProcess, Watching
 from sart_toolkit.hardware.servo import RESUME
@@ -60,7 +62,7 @@ class HardwareBackend(Backend):
 
     Attributes:
         cell: what is connected, and what it may do.
-        clock: the time [s] that the drivers tell.
+        clock: the time [s] that the drivers tell; that of the cell's world, if it has one.
         moves: whether the robot may move. If not, control isn't even taken over: commands are
             checked and then have no effect.
     """
@@ -103,6 +105,9 @@ class HardwareBackend(Backend):
 
     def _connect(self) -> None:
         cell, parts = self.cell, self._parts
+        parts.world = cell.make_world()
+        if parts.world is not None:
+            self.clock = parts.world.now
         for name, camera in cell.make_cameras(self.clock).items():
             parts.cameras[name] = camera
             self._asked(f"camera {name!r}", camera.connect)
@@ -120,7 +125,10 @@ class HardwareBackend(Backend):
             self._asked("gripper", gripper.start)
         first = parts.link.first
         self._history = deque([first])
-        self._started = self._told = first.time
+        self._told = first.time
+        # Time [s] until the clock was `_since`, and how fast it has passed from then on.
+        self._passed, self._since, self._pace = 0.0, first.time, cell.limits.speed_scale
+        self._guided = False
         self._force = first.force or 0.0
         self._target = first.q
         self._next: Array | None = None
@@ -163,13 +171,12 @@ class HardwareBackend(Backend):
         q, dq = self._at(at)
         path = [state.q for state in self._history if self._told < state.time < at]
         self._told = at
-        scale = self.cell.limits.speed_scale
         return Observation(
             q=q,
-            dq=dq / scale,
+            dq=dq / self._pace,
             gripper=self._opening,
             T_world_tool=self._model.fk(q),
-            time=(now - self._started) * scale,
+            time=self._passed + (now - self._since) * self._pace,
             cameras=views,
             joint_path=np.array([*path, q]),
         )
@@ -186,9 +193,14 @@ class HardwareBackend(Backend):
     def command(self, q: Array, gripper: float) -> CommandSent:
         """Set the targets of the next step; out of the workspace it stays at the last ones.
 
+        While a hand moves the arm only the gripper's has an effect.
+
         Raises:
             InvalidInput: wrong shape, not finite, outside limits, or a jump.
         """
+        if self._guided:
+            self._gripper_target = check_gripper(gripper)
+            return CommandSent(self._target.copy(), gripper)
         rows = np.atleast_2d(self._model.check_limits(q))
         gripper = check_gripper(gripper)
         steps = np.abs(np.diff(np.concatenate([self._target[None], rows]), axis=0))
@@ -226,10 +238,13 @@ class HardwareBackend(Backend):
         link = self._linked()
         link.push(rows, 1.0 / self.rates.control_hz)
         self._target = rows[-1]
-        states = link.wait(self.cell.control.buffer)
+        # Nothing is sent ahead to an arm that a hand moves.
+        states = link.wait(0.0 if self._guided else self.cell.control.buffer)
         self._remember(states)
         self._force = max((state.force or 0.0 for state in states), default=0.0)
-        if not self.moves:
+        if self._guided:
+            self._check_guided()
+        if self._guided or not self.moves:
             self._target = self._history[-1].q
         if gripper is not None:
             self._opening = self._asked("gripper", gripper.position)
@@ -242,6 +257,22 @@ class HardwareBackend(Backend):
                     f"camera {name!r}",
                     TimeoutError(f"its newest image is {age:.2f} s old; check its cable"),
                 )
+
+    def _check_guided(self) -> None:
+        """Return if the tool was left where a command may lead it.
+
+        Raises:
+            RobotStopped: it wasn't.
+        """
+        tool = self._model.fk(self._history[-1].q)[:3, 3]
+        if (off := self.cell.limits.workspace.outside(tool) + _BRAKING) > 0:
+            self._fail(
+                "arm",
+                ValueError(
+                    f"the tool was guided {off * 1e3:.0f} mm past where commands end, "
+                    f"{_BRAKING * 1e3:.0f} mm inside the workspace; move the arm back by hand"
+                ),
+            )
 
     def _remember(self, states: Sequence[ArmState]) -> None:
         # A state that was lost on its way is told twice.
@@ -282,6 +313,7 @@ class _Parts:
         self.link: Link | None = None
         self.gripper: Gripper | None = None
         self.cameras: dict[str, Camera] = {}
+        self.world: World | None = None
 
     def close(self) -> None:
         # The arm first: it may be moving.
@@ -294,6 +326,8 @@ class _Parts:
             if part is not None:
                 with suppress(Exception):
                     part.disconnect()
+        if self.world is not None:
+            self.world.close()
 
 
 class ForceHardwareBackend(HardwareBackend, SensesForce):
@@ -301,6 +335,41 @@ class ForceHardwareBackend(HardwareBackend, SensesForce):
 
     def force(self) -> float:
         return self._force
+
+
+class GuidedHardwareBackend(HardwareBackend, Guides):
+    """The robot of a cell whose arm a person's hand may move.
+
+    Meanwhile time passes as the person's does, whatever the cell's `speed_scale`, and the force is
+    the hand's as well: the cell's limit of it has no effect.
+    """
+
+    def guide(self) -> None:
+        self._linked().guide()
+        self._guided = True
+        self._go_at(1.0)
+
+    def hold(self) -> None:
+        if not self._guided:
+            return
+        state = self._linked().hold()
+        self._guided = False
+        self._remember([state])
+        self._target = state.q
+        self._go_at(self.cell.limits.speed_scale)
+
+    def _go_at(self, pace: float) -> None:
+        """Have time pass at another pace from now on."""
+        now = self._history[-1].time
+        self._passed += (now - self._since) * self._pace
+        self._since, self._pace = now, pace
+
+
+class AttendedHardwareBackend(HardwareBackend, Attended):
+    """The robot of a cell in a world that does itself what a person is asked to."""
+
+    def ask(self, text: str) -> None:
+        cast(Any, self._parts.world).attend(text)
 
 
 def without_motion(backend: type[HardwareBackend]) -> type[HardwareBackend]:
@@ -313,9 +382,15 @@ def cell_backend(cell: Cell | Path | str) -> type[HardwareBackend]:
 
     Raises:
         MissingFile, BrokenFile, InvalidInput: as `load_cell`.
-        UnknownName: its arm's driver can't be found.
+        UnknownName: the driver of its arm or of its world can't be found.
     """
     found = cell if isinstance(cell, Cell) else load_cell(cell)
     arm = resolve("arm", found.arm.driver, DRIVERS["arm"])
-    base = ForceHardwareBackend if getattr(arm, "senses_force", False) else HardwareBackend
-    return type("CellBackend", (base,), {"cell": found, "__doc__": base.__doc__})
+    world = found.world and resolve("world", found.world.driver, DRIVERS["world"])
+    abilities: dict[type[HardwareBackend], bool] = {
+        ForceHardwareBackend: getattr(arm, "senses_force", False),
+        GuidedHardwareBackend: hasattr(arm, "guide"),
+        AttendedHardwareBackend: hasattr(world, "attend"),
+    }
+    bases = tuple(ability for ability, has in abilities.items() if has) or (HardwareBackend,)
+    return type("CellBackend", bases, {"cell": found, "__doc__": HardwareBackend.__doc__})

@@ -255,6 +255,36 @@ class SensesContacts(SensesForce):
         return max((contact.force for contact in self.contacts()), default=0.0)
 
 
+class Attended(abc.ABC):
+    """Has somebody, or something, beside it that does what a person there is asked to."""
+
+    @abc.abstractmethod
+    def ask(self, text: str) -> None:
+        """Have done what a text says; returns when it is done."""
+
+
+class Guides(abc.ABC):
+    """Can have its arm moved by a person's hand."""
+
+    @abc.abstractmethod
+    def guide(self) -> None:
+        """Leave the arm to a person's hand: targets of joints have no effect until `hold`.
+
+        The gripper goes where it is commanded, and time passes as it does for the person.
+
+        Raises:
+            RobotStopped: something is wrong.
+        """
+
+    @abc.abstractmethod
+    def hold(self) -> None:
+        """Take the arm back, at rest where it is; without `guide` nothing happens.
+
+        Raises:
+            RobotStopped: something is wrong; the hand can't move it any more either.
+        """
+
+
 class KnowsBodies(abc.ABC):
     """Knows where the bodies are: those of the scene and those that the robot holds."""
 

@@ -16,6 +16,7 @@ from sart_toolkit.hardware.drivers import Arm, Camera, Clock, Gripper
 from sart_toolkit.hardware.images import as_described
 from sart_toolkit.robots import get_robot
 from sart_toolkit.robots.model import RobotModel
+from sart_toolkit.robots.spec import RobotSpec
 
 _SIZE = (128, 128)
 _CHECK = "check its address, its cable, and that it is switched on"
@@ -34,11 +35,22 @@ def examine_cell(cell: Cell, clock: Clock = time.monotonic) -> list[Finding]:
         cell: the cell.
         clock: the time [s] that its drivers tell.
 
+    A cell whose parts are in a world of their own is examined there, by that world's time.
+
     Raises:
         UnknownName: its robot or a driver can't be found.
         InvalidInput, Mismatch: its file has something that its drivers or its robot don't take.
     """
     spec = cell.mounted(get_robot(cell.robot))
+    world = cell.make_world()
+    try:
+        return _examined(cell, spec, clock if world is None else world.now)
+    finally:
+        if world is not None:
+            world.close()
+
+
+def _examined(cell: Cell, spec: RobotSpec, clock: Clock) -> list[Finding]:
     model = RobotModel(spec)
     gripper, cameras = cell.make_gripper(clock), cell.make_cameras(clock)
     findings = [_answer("arm", cell.make_arm(clock), lambda arm: _arm(arm, cell, model))]

@@ -61,7 +61,7 @@ def make_skeleton(kind: Kind, name: str, out: Path) -> Skeleton:
 
 
 def write_source(text: str, out: Path, overwrite: bool = False) -> None:
-    """Write a Python file.
+    """Write a file to begin with.
 
     Raises:
         OutputExists: it is there, and not to be overwritten.

@@ -259,7 +259,9 @@ class Record:
     device: Annotated[
         str,
         arg(
-            metavar="REF", help="What steers: keyboard, spacemouse, gamepad, scripted, or your own."
+            metavar="REF",
+            help="What steers: keyboard, spacemouse, gamepad, hand_guiding (a real arm, moved by "
+            "hand), scripted, or your own.",
         ),
     ] = "scripted"
     backend: _BACKEND = DEFAULT_BACKEND
@@ -1001,6 +1003,74 @@ class Deploy:
         bool, arg(help="Begin without a person's key, where this isn't typed at a terminal.")
     ] = False
     device: _DEVICE = "cpu"
+    json: _JSON = False
+
+
+@dataclass(frozen=True)
+class Emulate:
+    """Write the file of an emulated cell, to be used as that of a real one.
+
+    Example: sart emulate peg_in_hole --out cell.toml
+
+    Nothing runs by itself: whatever is given the file has a world of its own for as long as it
+    lasts, with a simulated arm that lags, a camera that is late and not quite where it should be,
+    and a gripper, at the task's start. So each of these begins there:
+
+    Example: sart doctor --cell cell.toml
+
+    Example: sart record peg_in_hole --backend cell.toml --out demo.h5
+
+    Example: sart suggest demo.h5 --source cloud --sensor d405 --out annotation.json
+
+    Example: sart augment demo.h5 annotation.json --source cloud --sensor d405 --out dataset --n 10
+
+    Example: sart train dataset --out skill
+
+    Example: sart deploy skill --backend cell.toml --unattended
+
+    With --hand a hand holds the arm, for `--device hand_guiding`:
+
+    Example: sart emulate peg_in_hole --hand demo.h5 --out guided.toml
+
+    Example: sart record peg_in_hole --backend guided.toml --device hand_guiding --out by_hand.h5
+
+    It tests the way that a real arm is used, and says nothing of how a real one moves.
+    """
+
+    task: _TASK
+    out: Annotated[Path, arg(help="TOML file to write.")]
+    robot: Annotated[
+        str | None, _optional("NAME", "Robot, by its name; the task's own if left out.")
+    ] = None
+    simulator: Annotated[Literal["pybullet", "sapien"], arg(help="What simulates it.")] = (
+        DEFAULT_BACKEND  # type: ignore[assignment]
+    )
+    placement: Annotated[
+        str, arg(metavar="X,Y,DEG", help="Where the object stands, from its middle [m], [deg].")
+    ] = "0,0,0"
+    hand: Annotated[
+        Path | None,
+        _optional(
+            "DEMO", "Demonstration whose joints a hand leads the arm along; none if left out."
+        ),
+    ] = None
+    image_height: Annotated[int, arg(help="Of the cameras' images, which are 4:3 [pixels].")] = 240
+    sensor: Annotated[Literal["d405", "d435", "exact"], arg(help="Whose errors the depth has.")] = (
+        "d405"
+    )
+    hand_eye_error: Annotated[
+        str,
+        arg(
+            metavar="MM,DEG",
+            help="How far cameras are from where they should be; declared in the file, too.",
+        ),
+    ] = "2,0.3"
+    latency: Annotated[float, arg(help="How old an image is when it arrives [s].")] = 0.03
+    lag: Annotated[float, arg(help="Time constant with which the arm follows [s].")] = 0.03
+    joint_noise: Annotated[float, arg(help="Of measured joints [rad].")] = 1e-5
+    speed_scale: Annotated[float, arg(help="How fast it goes of what is commanded.")] = 1.0
+    seed: _SEED = 0
+    overwrite: _OVERWRITE = False
     json: _JSON = False
 
 

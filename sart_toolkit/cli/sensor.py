@@ -72,7 +72,7 @@ def declared_sensor(flags: SensorFlags, demos: Sequence[Path]) -> SensorErrors |
             raise InvalidInput("--depth-scale-error: --calibration declares it; leave this out")
         depth_scale = depth_scale if calibrated is None else calibrated
     elif flags.hand_eye_error is not None:
-        hand_eye = _hand_eye(flags.hand_eye_error)
+        hand_eye = hand_eye_error(flags.hand_eye_error)
     else:
         hand_eye = _of_their_cells(demos)
     return sensor_errors(flags.sensor or "exact", hand_eye, depth_scale or 0.0)
@@ -101,8 +101,12 @@ def _of_their_cells(demos: Sequence[Path]) -> tuple[float, float]:
     return max(length for length, _ in found), max(angle for _, angle in found)
 
 
-def _hand_eye(text: str) -> tuple[float, float]:
-    """Metres and degrees from "MM,DEG"."""
+def hand_eye_error(text: str) -> tuple[float, float]:
+    """Metres and degrees from "MM,DEG".
+
+    Raises:
+        InvalidInput: it is something else.
+    """
     try:
         length, angle = (float(word) for word in text.split(","))
     except ValueError as error:

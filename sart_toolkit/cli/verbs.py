@@ -60,6 +60,7 @@ VERBS: Mapping[str, Verb] = {
     "train": Verb(arguments.Train, "sart_toolkit.cli.train:train_verb"),
     "evaluate": Verb(arguments.Evaluate, "sart_toolkit.cli.train:evaluate_verb"),
     "deploy": Verb(arguments.Deploy, "sart_toolkit.cli.deploy:deploy_verb"),
+    "emulate": Verb(arguments.Emulate, "sart_toolkit.cli.emulate:emulate_verb"),
     "compare": Verb(arguments.Compare, "sart_toolkit.cli.compare:compare_verb"),
     "report": Verb(arguments.Report, "sart_toolkit.cli.run:report_verb"),
     "benchmark": Verb(arguments.Benchmark, "sart_toolkit.cli.benchmark:plan_verb"),

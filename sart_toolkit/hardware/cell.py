@@ -16,12 +16,12 @@ import numpy as np
 
 from sart_toolkit.errors import BrokenFile, InvalidInput, Mismatch, MissingFile, nearest_name
 from sart_toolkit.hardware import DRIVERS
-from sart_toolkit.hardware.drivers import Arm, Camera, Clock, Gripper
+from sart_toolkit.hardware.drivers import Arm, Camera, Clock, Gripper, World
 from sart_toolkit.poses import Array, check_array, check_pose, check_positive, frozen
 from sart_toolkit.registry import resolve
 from sart_toolkit.robots.spec import RobotSpec
 
-Kind = Literal["arm", "gripper", "camera"]
+Kind = Literal["arm", "gripper", "camera", "world"]
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,8 @@ class Control:
 class Cell:
     """An arm, perhaps a gripper, cameras by name, and what the arm may do there.
 
-    `robot`: the robot's name; a backend of the cell moves no other.
+    `robot`: the robot's name; a backend of the cell moves no other. `world`: where its parts are,
+    if not in the real one. That is made before them, in the same process, and tells the time.
     """
 
     robot: str
@@ -173,6 +174,17 @@ class Cell:
     gripper: Part | None = None
     cameras: Mapping[str, CameraPart] = field(default_factory=dict)
     control: Control = field(default_factory=Control)
+    world: Part | None = None
+
+    def __post_init__(self) -> None:
+        if self.world is not None and self.control.process:
+            raise InvalidInput("[control] process: expected false where the cell has a [world]")
+
+    def make_world(self) -> World | None:
+        """The world of its parts, or `None` where that is the real one; raises as `Part.made`."""
+        if self.world is None:
+            return None
+        return cast(World, self.world.made(robot=self.robot, rate_hz=self.control.rate_hz))
 
     def make_arm(self, clock: Clock = time.monotonic) -> Arm:
         """The arm's driver, not connected yet; raises as `Part.made`."""
@@ -242,7 +254,7 @@ def load_cell(path: Path | str) -> Cell:
 
 
 def _cell(tables: dict[str, Any]) -> Cell:
-    known = ("robot", "arm", "gripper", "camera", "limits", "control")
+    known = ("robot", "world", "arm", "gripper", "camera", "limits", "control")
     for name in tables:
         if name not in known:
             raise InvalidInput(_unknown("cell", name, known))
@@ -261,13 +273,14 @@ def _cell(tables: dict[str, Any]) -> Cell:
         cameras={name: _camera(name, table) for name, table in cameras.items()},
         limits=_record("[limits]", limits, Limits),
         control=_record("[control]", tables.get("control", {}), Control),
+        world=_part("world", tables["world"]) if "world" in tables else None,
     )
 
 
 def _part(kind: Kind, table: Any, where: str | None = None) -> Part:
     options = dict(_table(where or kind, table))
     if "driver" not in options:
-        choices = ", ".join(DRIVERS[kind])
+        choices = ", ".join(DRIVERS[kind]) or "file.py:NAME"
         raise InvalidInput(f"[{where or kind}] driver: is missing; choose from {choices}")
     driver = _text(f"[{where or kind}] driver", options.pop("driver"))
     return Part(kind, driver, options)

@@ -8,6 +8,7 @@ has the robot stopped then.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -31,6 +32,19 @@ class ArmState:
     time: float
     trouble: str = ""
     force: float | None = None
+
+
+class World(Protocol):
+    """Where a cell's parts are, where that isn't the real world; they find it by themselves.
+
+    One with a method `attend(text)` does by itself what a person beside a robot is asked to.
+    """
+
+    def now(self) -> float:
+        """Its time [s]."""
+
+    def close(self) -> None:
+        """Free it; calling it again does nothing."""
 
 
 class Arm(Protocol):
@@ -62,6 +76,19 @@ class Arm(Protocol):
 
     def disconnect(self) -> None:
         """Close the connection; calling it again does nothing."""
+
+
+class GuidedArm(Arm, Protocol):
+    """An arm that a person's hand may move, too; one that can't has none of these methods."""
+
+    def guide(self) -> None:
+        """Leave the joints to a person's hand for the next period, in place of `servo`."""
+
+    def hold(self) -> None:
+        """Take the joints back where they are; without `guide` nothing happens. `stop` does so too.
+
+        Targets may be sent again.
+        """
 
 
 class Gripper(Protocol):
@@ -111,6 +138,23 @@ class Camera(Protocol):
 
     def disconnect(self) -> None:
         """Close it; calling it again does nothing."""
+
+
+class Periods:
+    """Waits for each of an arm's periods to begin, where its own library doesn't."""
+
+    def __init__(self, rate_hz: int, clock: Clock) -> None:
+        """Count `rate_hz` periods a second by a clock, from `start` on."""
+        self._period, self._clock, self._next = 1.0 / rate_hz, clock, 0.0
+
+    def start(self) -> None:
+        """A period begins now."""
+        self._next = self._clock()
+
+    def wait(self) -> None:
+        """Return when the next one begins; those that were missed are left out."""
+        self._next = max(self._next + self._period, self._clock())
+        time.sleep(max(0.0, self._next - self._clock()))
 
 
 class ClockOffset:

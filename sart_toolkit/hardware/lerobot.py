@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sart_toolkit.errors import InvalidInput
-from sart_toolkit.hardware.drivers import ArmState, Clock
+from sart_toolkit.hardware.drivers import ArmState, Clock, Periods
 from sart_toolkit.poses import Array
 from sart_toolkit.registry import resolve
 
@@ -46,10 +46,9 @@ class LeRobotArm:
             raise InvalidInput(f"unit: expected 'deg' or 'rad', got {unit!r}")
         self._reference, self._joints, self._clock = robot, tuple(joints), clock
         self._scale = np.pi / 180 if unit == "deg" else 1.0
-        self._period = 1.0 / rate_hz
+        self._period, self._periods = 1.0 / rate_hz, Periods(rate_hz, clock)
         self._robot: Any = None
         self._before: tuple[float, Array] | None = None
-        self._next = 0.0
 
     def connect(self) -> None:
         made = resolve("LeRobot arm", self._reference, {})
@@ -67,7 +66,7 @@ class LeRobotArm:
                 )
 
     def start(self) -> None:
-        self._next = self._clock()
+        self._periods.start()
 
     def read(self) -> ArmState:
         seen, now = self._robot.get_observation(), self._clock()
@@ -84,8 +83,7 @@ class LeRobotArm:
         self._robot.send_action(dict(zip(self._joints, values, strict=True)))
 
     def wait(self) -> None:
-        self._next = max(self._next + self._period, self._clock())
-        time.sleep(max(0.0, self._next - self._clock()))
+        self._periods.wait()
 
     def stop(self) -> None:
         if self._robot is not None:

@@ -24,6 +24,7 @@ from sart_toolkit.robots.spec import Attachment, RobotSpec
 _START_TIME, _ANSWER_TIME = 60.0, 0.5
 # For so long [s] it remembers what the arm measured, in case nobody asks.
 _REMEMBERED = 10.0
+_REPORT = "report"
 _NO_ANSWER = (
     f"robot stopped: the process that moves the arm doesn't answer; see the robot, {RESUME}"
 )
@@ -45,6 +46,12 @@ class Link(Protocol):
 
     def newest(self) -> Sequence[ArmState]:
         """What the arm measured since, without waiting; nothing where time stands still."""
+
+    def guide(self) -> None:
+        """Leave the arm to a person's hand, until `hold`: what is pushed only takes its time."""
+
+    def hold(self) -> ArmState:
+        """Take the arm back; what it measures where it is then."""
 
     def stop(self, reason: str) -> None:
         """Stop the arm for good."""
@@ -84,6 +91,12 @@ class Inline:
     def newest(self) -> Sequence[ArmState]:
         return ()
 
+    def guide(self) -> None:
+        self._servo.guide()
+
+    def hold(self) -> ArmState:
+        return self._servo.hold()
+
     def stop(self, reason: str) -> None:
         self._servo.stop(reason)
 
@@ -116,6 +129,12 @@ class Watching:
 
     def newest(self) -> Sequence[ArmState]:
         return [self._read()]
+
+    def guide(self) -> None:
+        pass
+
+    def hold(self) -> ArmState:
+        return self._read()
 
     def stop(self, reason: str) -> None:
         pass
@@ -151,7 +170,9 @@ class OwnProcess:
         )
         self._process.start()
         theirs.close()
-        self._pushed, self._consumed, self._speed = 0.0, 0.0, cell.limits.speed_scale
+        self._pushed, self._consumed = 0.0, 0.0
+        # How fast what is pushed is followed.
+        self._scale = self._speed = cell.limits.speed_scale
         try:
             self.first = self._answer(_START_TIME)
         except BaseException:
@@ -159,7 +180,7 @@ class OwnProcess:
             raise
 
     def push(self, targets: Array, seconds: float) -> None:
-        self._send((targets, seconds))
+        self._send("push", targets, seconds)
         self._pushed += seconds
 
     def wait(self, left: float) -> Sequence[ArmState]:
@@ -172,13 +193,24 @@ class OwnProcess:
             time.sleep(max(over, 1e-3) / self._speed)
 
     def newest(self) -> Sequence[ArmState]:
-        self._send("report")
+        self._send(_REPORT)
         self._consumed, states = self._answer(_ANSWER_TIME)
         return list(states)
 
+    def guide(self) -> None:
+        self._send("guide")
+        # A hand isn't slowed down.
+        self._speed = 1.0
+
+    def hold(self) -> ArmState:
+        self._send("hold")
+        self._speed = self._scale
+        state: ArmState = self._answer(_ANSWER_TIME)
+        return state
+
     def stop(self, reason: str) -> None:
         with suppress(RobotStopped):
-            self._send(reason)
+            self._send("stop", reason)
 
     def close(self) -> None:
         self._pipe.close()
@@ -188,9 +220,10 @@ class OwnProcess:
             self._process.terminate()
             self._process.join()
 
-    def _send(self, message: Any) -> None:
+    def _send(self, what: str, *values: Any) -> None:
+        """Have the servo do something, by its method's name, or ask for a report."""
         try:
-            self._pipe.send(message)
+            self._pipe.send((what, *values))
         except OSError as error:
             raise RobotStopped(_NO_ANSWER) from error
 
@@ -249,14 +282,12 @@ def _move(servo: Servo, pipe: Connection, rate_hz: int) -> None:
     states: deque[ArmState] = deque(maxlen=round(_REMEMBERED * rate_hz))
     while True:
         while pipe.poll():
-            message = pipe.recv()
-            if message == "report":
+            what, *values = pipe.recv()
+            if what == _REPORT:
                 pipe.send((servo.consumed, list(states)))
                 states.clear()
-            elif isinstance(message, str):
-                servo.stop(message)
-            else:
-                servo.push(*message)
+            elif (answer := getattr(servo, what)(*values)) is not None:
+                pipe.send(answer)
         states.append(servo.tick())
 
 
@@ -264,5 +295,5 @@ def _refuse(error: SartError, pipe: Connection) -> None:
     """Answer every question with an error, until the pipe is closed."""
     pipe.send(error)
     while True:
-        if pipe.recv() == "report":
+        if pipe.recv()[0] == _REPORT:
             pipe.send(error)

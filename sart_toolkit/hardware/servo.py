@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections import deque
 from contextlib import suppress
+from typing import cast
 
 import numpy as np
 
 from sart_toolkit.data.records import Rates
 from sart_toolkit.errors import RobotStopped, SartError
 from sart_toolkit.hardware.cell import Cell
-from sart_toolkit.hardware.drivers import Arm, ArmState, Clock
+from sart_toolkit.hardware.drivers import Arm, ArmState, Clock, GuidedArm
 from sart_toolkit.motion.interpolator import JointInterpolator
 from sart_toolkit.poses import Array
 from sart_toolkit.robots.model import RobotModel
 
 # What rounding may add to a difference of joints, as a share of its limit.
 _ROUNDING = 1e-6
+# For so long [s] a hand may move an arm while nobody follows what it does.
+_MOST_UNASKED = 1.0
 RESUME = "then type the same command again"
 
 
@@ -29,6 +32,9 @@ class Servo:
     mode let it move, the force at the tool, how far the joints are behind; and of the target
     velocity, acceleration, jerk, and the workspace. Whatever is wrong, or raises, stops the arm for
     good.
+
+    A person's hand may move the arm instead (`guide`): no targets are sent then, what is given
+    only takes its time, and all of the state is checked but force and lag, which are the hand's.
 
     Attributes:
         consumed: for how long [s] the arm has gone along what it was given, at the speed given.
@@ -55,6 +61,9 @@ class Servo:
         self._rows: deque[Array] = deque()
         self._knots: deque[tuple[float, Array]] = deque()
         self._pushed = self.consumed = 0.0
+        self._guided = False
+        # For how long [s] it has been guided without anybody waiting for it.
+        self._unasked = 0.0
         self.stopped = ""
 
     def start(self) -> ArmState:
@@ -65,13 +74,37 @@ class Servo:
         """
         try:
             self._arm.start()
-            state = self._checked()
+            return self._rest()
         except Exception as error:
             raise self._stop(error) from error
+
+    def _rest(self) -> ArmState:
+        """What the arm measures where it is at rest; targets lead on from there."""
+        state = self._checked()
         self._interpolator.reset(state.q)
-        self._knots.append((0.0, state.q))
+        self._rows.clear()
+        self._knots = deque([(self._pushed, state.q)])
+        self.consumed = self._pushed
         self._sent = [state.q] * 4
         return state
+
+    def guide(self) -> None:
+        """Leave the arm to a person's hand, from the next `tick` to `hold`."""
+        self._guided, self.consumed = True, self._pushed
+        self._unasked = 0.0
+
+    def hold(self) -> ArmState:
+        """Take the arm back from a person's hand; what it measures where it is then.
+
+        Raises:
+            RobotStopped: it can't be moved.
+        """
+        try:
+            cast(GuidedArm, self._arm).hold()
+            self._guided = False
+            return self._rest()
+        except Exception as error:
+            raise self._stop(error) from error
 
     @property
     def target(self) -> Array:
@@ -81,8 +114,9 @@ class Servo:
     def push(self, targets: Array, seconds: float) -> None:
         """Give joints `(m, n)` [rad] to follow, at even steps over the next `seconds`."""
         start = self._pushed
-        for i, q in enumerate(targets, 1):
-            self._knots.append((start + seconds * i / len(targets), q))
+        if not self._guided:
+            for i, q in enumerate(targets, 1):
+                self._knots.append((start + seconds * i / len(targets), q))
         self._pushed = start + seconds
 
     def tick(self) -> ArmState:
@@ -95,14 +129,31 @@ class Servo:
             raise RobotStopped(self.stopped)
         try:
             state = self._checked()
-            q = self._next()
-            self._check_target(q, state)
-            self._arm.servo(q, self._period)
-            self._sent = [*self._sent[1:], q]
+            if self._guided:
+                cast(GuidedArm, self._arm).guide()
+                self._check_awaited()
+                # By less than a period beyond what was given, so that periods add up to it.
+                self.consumed = min(self.consumed, self._pushed) + self._period
+            else:
+                q = self._next()
+                self._check_target(q, state)
+                self._arm.servo(q, self._period)
+                self._sent = [*self._sent[1:], q]
             self._arm.wait()
         except Exception as error:
             raise self._stop(error) from error
         return state
+
+    def _check_awaited(self) -> None:
+        """Return if somebody still follows what a hand does.
+
+        Raises:
+            RobotStopped: nobody does; a free arm would stay free.
+        """
+        waits = self.consumed < self._pushed
+        self._unasked = 0.0 if waits else self._unasked + self._period
+        if self._unasked > _MOST_UNASKED:
+            raise _stopped("arm: a hand could move it, but the program doesn't follow any more")
 
     def close(self) -> None:
         """Stop the arm and disconnect."""
@@ -140,7 +191,8 @@ class Servo:
             )
         if state.trouble:
             raise _stopped(f"arm: {state.trouble}")
-        if state.force is not None and not state.force <= limits.force:
+        pressed = state.force is not None and not state.force <= limits.force
+        if pressed and not self._guided:
             raise _stopped(
                 f"arm: {state.force:.0f} N at the tool, expected at most {limits.force:g} N; see "
                 "what it touches and clear the way"

@@ -42,7 +42,8 @@ _SAFETY_MODES = {
 class UrRtdeArm:
     """A UR arm (CB3 or e-Series) that follows `servoJ` targets.
 
-    The controller's own watchdog ends the motion where targets stop coming.
+    The controller's own watchdog ends the motion, or a person's guiding, where it isn't kicked in
+    every period. A hand moves it in the controller's freedrive.
     """
 
     senses_force = True
@@ -85,6 +86,7 @@ class UrRtdeArm:
         self._receive: Any = None
         self._control: Any = None
         self._period: Any = None
+        self._guided = False
 
     def connect(self) -> None:
         module = _imported("rtde_receive")
@@ -121,16 +123,38 @@ class UrRtdeArm:
             )
         control.kickWatchdog()
 
+    def guide(self) -> None:
+        control = self._control
+        if not self._guided:
+            # Only one of them may move the arm.
+            control.servoStop(self._deceleration)
+            control.kickWatchdog()
+            # Where its answer is lost it may be free nevertheless.
+            self._guided = True
+            if not control.teachMode():
+                raise ConnectionError(
+                    f"arm at {self._host}: refuses freedrive; see the pendant, and set remote "
+                    "control"
+                )
+        control.kickWatchdog()
+
+    def hold(self) -> None:
+        if self._guided and not self._control.endTeachMode():
+            raise ConnectionError(f"arm at {self._host}: doesn't leave freedrive; see the pendant")
+        self._guided = False
+
     def wait(self) -> None:
         self._control.waitPeriod(self._period)
         self._period = self._control.initPeriod()
 
     def stop(self) -> None:
         control, self._control = self._control, None
+        guided, self._guided = self._guided, False
         if control is None:
             return
         # Each is worth trying whatever became of the one before.
         for last in (
+            *([control.endTeachMode] if guided else []),
             lambda: control.servoStop(self._deceleration),
             control.stopScript,
             control.disconnect,

@@ -20,18 +20,27 @@ from sart_toolkit.backends import BACKENDS
 from sart_toolkit.backends.interface import (
     Backend,
     Contact,
+    Guides,
     Observation,
     Resets,
     SavesStates,
     SensesContacts,
     SensesForce,
     missing_abilities,
+    require,
 )
 from sart_toolkit.data.records import Demonstration, Judge, library_versions
 from sart_toolkit.errors import InvalidInput, MotionRejected, RobotStopped, Unreachable
 from sart_toolkit.motion.config import ControllerConfig
 from sart_toolkit.motion.controller import ToolController
-from sart_toolkit.poses import Array, apply_motion, check_array, check_positive, frozen
+from sart_toolkit.poses import (
+    Array,
+    apply_motion,
+    check_array,
+    check_positive,
+    frozen,
+    relative_motion,
+)
 from sart_toolkit.record.recorder import StepRecorder
 from sart_toolkit.registry import reference_to
 from sart_toolkit.robots import ROBOTS
@@ -91,11 +100,13 @@ class Device(abc.ABC):
         name: kept with the demonstration.
         operator: who steers.
         interactive: whether a person holds it, and so needs to see what happens.
+        guides: whether a hand moves the arm itself; of its commands the gripper's alone count.
     """
 
     name: str
     operator: str
     interactive: bool = False
+    guides: bool = False
 
     @abc.abstractmethod
     def read(self, observation: Observation) -> TeleopCommand:
@@ -110,6 +121,7 @@ class SessionConfig:
     `end_on_success`: it ends by itself once the goal has been reached for the task's `hold`.
     `references`: what names "robot", "task" or "backend" in the demonstration, where that isn't to
     be found out; `appearance`: that of the backend, where it isn't the task's own, to be kept.
+    `guided`: a hand moves the arm while it records, and where it went becomes what is commanded.
     """
 
     cameras: tuple[str, ...] = ("wrist",)
@@ -119,6 +131,7 @@ class SessionConfig:
     controller: ControllerConfig = field(default_factory=ControllerConfig)
     references: Mapping[str, str] = field(default_factory=dict)
     appearance: Appearance | None = None
+    guided: bool = False
 
     def __post_init__(self) -> None:
         check_positive("max_seconds", self.max_seconds, "s")
@@ -147,7 +160,7 @@ class TeleopSession:
     """A demonstration in the making: ready, recording, paused, ended, saved.
 
     It draws nothing, and only the backend makes it wait: each `advance` is one control period.
-    While it isn't recording a simulation stands still.
+    While it isn't recording a simulation stands still, and an arm that a hand guides is held.
 
     A backend that can't be reset is recorded from wherever the robot is, and its placement is the
     one given. One that lacks what the task's success is judged by records no success; a person may
@@ -184,7 +197,7 @@ class TeleopSession:
 
         Raises:
             UnknownName: there is no such camera.
-            MissingCapability: the backend takes no images.
+            MissingCapability: the backend takes no images, or no hand can guide it.
         """
         self.backend, self.task, self.model = backend, task, model
         self.placement = placement or Placement()
@@ -198,6 +211,9 @@ class TeleopSession:
         keeps = self.config.keep_states and isinstance(backend, SavesStates)
         self._saves = backend if keeps and isinstance(backend, SavesStates) else None
         self._judges = not missing_abilities(backend, task.observes)
+        self._guides = (
+            require(backend, Guides, "a hand is to guide its arm") if self.config.guided else None
+        )
         self._prepare()
 
     def _prepare(self) -> None:
@@ -299,6 +315,8 @@ class TeleopSession:
         self._pauses.append((len(self._success), self.backend.observe().time - self._now.time))
         if self._started_at is None:
             self._started_at = self._clock()
+        if self._guides is not None:
+            self._guides.guide()
         self.state = SessionState.RECORDING
 
     def pause(self) -> None:
@@ -308,7 +326,8 @@ class TeleopSession:
             InvalidInput: it isn't recording.
         """
         self._expect("pause", SessionState.RECORDING)
-        self.state = SessionState.PAUSED
+        if self._held():
+            self.state = SessionState.PAUSED
 
     def redo(self) -> None:
         """Forget what was recorded; robot and scene are as at the start again.
@@ -323,6 +342,7 @@ class TeleopSession:
             SessionState.PAUSED,
             SessionState.ENDED,
         )
+        self._held()
         self._prepare()
 
     def stop(self) -> None:
@@ -332,9 +352,13 @@ class TeleopSession:
             InvalidInput: nothing is being recorded.
         """
         self._expect("stop", SessionState.RECORDING, SessionState.PAUSED)
-        self._step(np.zeros(6), self.gripper)
-        while len(self._raw) % self.backend.rates.control_per_record:
+        try:
             self._step(np.zeros(6), self.gripper)
+            while len(self._raw) % self.backend.rates.control_per_record:
+                self._step(np.zeros(6), self.gripper)
+        except RobotStopped as error:
+            self._end_stopped(error)
+            return
         self._end(End.STOPPED)
 
     def say_reached(self) -> None:
@@ -374,15 +398,13 @@ class TeleopSession:
             InvalidInput: it isn't recording.
         """
         self._expect("advance", SessionState.RECORDING)
+        if command.stop:
+            self.stop()
+            return
         try:
-            if command.stop:
-                self.stop()
-                return
             self._step(command.velocity, command.gripper)
         except RobotStopped as error:
-            del self._raw[(self.steps - 1) * self.backend.rates.control_per_record :]
-            self.trouble = str(error)
-            self._end(End.ROBOT_STOPPED)
+            self._end_stopped(error)
             return
         if len(self._raw) % self.backend.rates.control_per_record:
             return
@@ -399,18 +421,39 @@ class TeleopSession:
             )
 
     def _end(self, end: End) -> None:
+        if self._held():
+            self._seconds_spent = self.seconds_spent
+            self.state, self.end = SessionState.ENDED, end
+
+    def _end_stopped(self, error: RobotStopped) -> None:
+        """End with the whole steps until a real robot stopped."""
+        del self._raw[(self.steps - 1) * self.backend.rates.control_per_record :]
+        self.trouble = str(error)
         self._seconds_spent = self.seconds_spent
-        self.state, self.end = SessionState.ENDED, end
+        self.state, self.end = SessionState.ENDED, End.ROBOT_STOPPED
+
+    def _held(self) -> bool:
+        """Whether the arm is held, as it is unless a hand guides it; if it can't be, it ends."""
+        try:
+            if self._guides is not None:
+                self._guides.hold()
+        except RobotStopped as error:
+            self._end_stopped(error)
+            return False
+        return True
 
     # --- one control period ---------------------------------------------------------------------
 
     def _step(self, velocity: Array, gripper: float) -> None:
         """Steer for one control period and measure; the last of a recorded step is recorded."""
+        if self._guides is not None:
+            velocity = self._guided(gripper)
+        else:
+            sent = self.backend.command(self._steered(velocity), gripper)
+            self._controller.acknowledge(sent.q)
+            self.gripper = sent.gripper
+            self.backend.step()
         self._raw.append(np.append(velocity, gripper))
-        sent = self.backend.command(self._steered(velocity), gripper)
-        self._controller.acknowledge(sent.q)
-        self.gripper = sent.gripper
-        self.backend.step()
         if self._touch is not None:
             touching = self._touch.contacts()
             self._touched |= {(contact.a, contact.b) for contact in touching}
@@ -426,6 +469,18 @@ class TeleopSession:
         if self._saves is not None:
             self._states.append(self._saves.save())
         self._success.append(self._reached())
+
+    def _guided(self, gripper: float) -> Array:
+        """The tool's velocity `(6,)` over a control period in which a hand moved it.
+
+        Where it is then becomes the command.
+        """
+        self.gripper = self.backend.command(self._controller.commanded_q, gripper).gripper
+        self.backend.step()
+        before = self._controller.commanded_T_world_tool
+        self._controller.reset(self.backend.observe().q)
+        moved = relative_motion(before, self._controller.commanded_T_world_tool)
+        return moved * self.backend.rates.control_hz
 
     def _steered(self, velocity: Array) -> Array:
         """Joint targets `(m, n)` of a control period at a tool velocity; else stay, and say."""

@@ -205,6 +205,16 @@ class RecordingWindow:
         screen.box((806, 394, 20 + 8 * len(camera), 20), BACKGROUND, radius=4)
         screen.text((812, 395), camera, 13, FAINT)
         left = 1096
+        if not device.guides:
+            self._speed_and_directions(left)
+        screen.text((left, 344), "Gripper (Space)", 14, FAINT)
+        screen.bar((left, 370, 168, 10), session.observation.gripper, BLUE)
+        # While nothing moves, what the hand has asked for in the meantime.
+        commanded = "open" if device.gripper < 0.5 else "closed"
+        screen.text((left, 388), f"commanded: {commanded}", 15)
+
+    def _speed_and_directions(self, left: int) -> None:
+        screen, device = self._screen, self._desk.device
         screen.text((left, 140), "Speed", 14, FAINT)
         for i, speed in enumerate(SPEEDS):
             chosen = speed is device.speed
@@ -219,11 +229,6 @@ class RecordingWindow:
             screen.box((left + 86 * i, 298, 82, 30), BLUE if chosen else CARD, radius=6)
             colour = BACKGROUND if chosen else TEXT
             screen.text((left + 41 + 86 * i, 304), frame, 15, colour, align="middle")
-        screen.text((left, 344), "Gripper (Space)", 14, FAINT)
-        screen.bar((left, 370, 168, 10), session.observation.gripper, BLUE)
-        # While nothing moves, what the hand has asked for in the meantime.
-        commanded = "open" if device.gripper < 0.5 else "closed"
-        screen.text((left, 388), f"commanded: {commanded}", 15)
 
     def _notice(self) -> None:
         notice = self._desk.notice
@@ -250,15 +255,17 @@ class RecordingWindow:
         screen, desk = self._screen, self._desk
         screen.box((800, 576, 464, 208), CARD)
         view = "scene" if desk.device.frame == "world" else "wrist"
-        screen.text((814, 584), f"{desk.device.name}, directions as in the {view} view", 13, FAINT)
+        directions = "" if desk.device.guides else f", directions as in the {view} view"
+        screen.text((814, 584), f"{desk.device.name}{directions}", 13, FAINT)
         for i, (keys, what) in enumerate(desk.device.key_map):
             self._row((814, 608 + 24 * i), keys, what, 96)
         meanings = _MEANINGS[desk.session.state]
         for i, (keys, what) in enumerate(zip(["→", "←", "Esc"], meanings, strict=True)):
             if what:
                 self._row((1096, 608 + 24 * i), keys, what, 58)
-        for i, (keys, what) in enumerate((("1 2 3", "speed"), ("F", "directions"))):
-            self._row((1096, 680 + 24 * i), keys, what, 58)
+        if not desk.device.guides:
+            for i, (keys, what) in enumerate((("1 2 3", "speed"), ("F", "directions"))):
+                self._row((1096, 680 + 24 * i), keys, what, 58)
         self._row((1096, 728), "Space", "gripper", 58)
         share = self._pace.share
         words = "in real time" if share > 0.97 else f"at {share:.0%} of real time"

@@ -1,8 +1,7 @@
-"""An emulated cell: a UR arm, a Robotiq gripper and an RGB-D camera with PyBullet as their world.
+"""An emulated cell: an arm, a Robotiq gripper and RGB-D cameras with a simulator as their world.
 
-`EmulatedBackend` is the hardware backend over it, in any task's scene:
-
-    sart record peg_in_hole --backend sart_toolkit.testing.emulated:EmulatedBackend --out demo.h5
+`sart emulate` writes the file of such a cell, whose world is a `TaskWorld`. `EmulatedBackend` is
+the hardware backend over one in any task's scene.
 
 What is real: everything of `sart_toolkit` down to the drivers, and the gripper's socket and its
 protocol. What isn't: **RTDE itself is not emulated.** In place of the modules `rtde_control` and
@@ -21,26 +20,34 @@ import socketserver
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from sart_toolkit.backends.hardware import ForceHardwareBackend
-from sart_toolkit.backends.interface import Observation
-from sart_toolkit.backends.pybullet import PyBulletBackend
+from sart_toolkit.backends import DEFAULT_BACKEND, make_backend
+from sart_toolkit.backends.hardware import ForceHardwareBackend, GuidedHardwareBackend
+from sart_toolkit.backends.interface import Backend, Observation, Simulator
 from sart_toolkit.benchmark.noise import measured_depth
-from sart_toolkit.collision.sensor import SENSORS, SensorErrors
+from sart_toolkit.collision.sensor import SENSORS, SensorErrors, sensor_errors
 from sart_toolkit.data.records import DEFAULT_RATES, Rates
 from sart_toolkit.data.sampling import sample_direction
+from sart_toolkit.data.storage import load_demonstration
+from sart_toolkit.errors import InvalidInput, Mismatch
 from sart_toolkit.hardware.cell import CameraPart, Cell, Control, Limits, Part, Workspace
 from sart_toolkit.hardware.drivers import CameraImage, Clock
-from sart_toolkit.poses import Array, pose
+from sart_toolkit.hardware.robotiq import RobotiqSocket
+from sart_toolkit.poses import Array, check_array, pose
+from sart_toolkit.robots import get_robot
+from sart_toolkit.robots.model import RobotModel
 from sart_toolkit.robots.spec import ImageSize, RobotSpec, check_image_size
 from sart_toolkit.scenes.spec import SceneSpec, SceneState
+from sart_toolkit.tasks import get_task
+from sart_toolkit.tasks.task import Placement
 
 _FPS = 30
 # At least so often a second the world's physics advances.
@@ -106,7 +113,7 @@ FAULTS = (
 
 
 class EmulatedWorld:
-    """Where an emulated arm, gripper and camera are, in a scene simulated by PyBullet.
+    """Where an emulated arm, gripper and cameras are, in a simulated scene.
 
     Attributes:
         host: the address that the fakes of `ur-rtde` know it by.
@@ -114,6 +121,7 @@ class EmulatedWorld:
         calls: what the arm was called, the newest last.
         sent: `(time, q)` of each target that the arm was sent.
         q: where the joints really are `(n,)` [rad].
+        free: whether a hand may move the arm.
     """
 
     _numbers = itertools.count()
@@ -124,23 +132,43 @@ class EmulatedWorld:
         scene: SceneSpec,
         image_size: ImageSize = 128,
         emulation: Emulation | None = None,
+        simulator: str | type[Backend] = DEFAULT_BACKEND,
+        host: str | None = None,
     ) -> None:
-        """Begin with the robot at home and the bodies where the scene has them."""
+        """Begin with the robot at home and the bodies where the scene has them.
+
+        Args:
+            robot: the robot, its cameras where they are said to be.
+            scene: what surrounds it.
+            image_size: its height is that of the cameras' images, which are 4:3.
+            emulation: what isn't ideal.
+            simulator: what simulates it.
+            host: what its parts know it by; one of its own if left out.
+
+        Raises:
+            InvalidInput: the simulator is none, or there is another world of that name.
+        """
+        if host in _WORLDS:
+            raise InvalidInput(f"world {host!r}: is open already; close it, or name this another")
         self.emulation = it = emulation or Emulation()
         self._rng = np.random.default_rng(it.seed)
         self._robot, self._scene = robot, scene
         self._period = 1.0 / it.rate_hz
         physics = it.rate_hz * max(1, -(-_PHYSICS_HZ // it.rate_hz))
-        self._sim = PyBulletBackend(
-            self._displaced(robot), scene, image_size, Rates(physics, it.rate_hz, it.rate_hz)
-        )
+        rates = Rates(physics, it.rate_hz, it.rate_hz)
+        made = make_backend(simulator, self._displaced(robot), scene, image_size, rates)
+        if not isinstance(made, Simulator):
+            made.close()
+            raise InvalidInput(f"simulator: expected pybullet or sapien, got {made.name!r}")
+        self._sim = made
         _, height = check_image_size(image_size)
         self._size = -(-height * 4 // 3), height
         self.time, self.calls, self.sent = 0.0, list[Call](), list[tuple[float, Array]]()
         self._faults: list[_Fault] = []
+        self._hand: Callable[[float], Array] | None = None
         self.gripper_target = 0.0
         self.reset(scene.initial_state(robot.home, 0.0))
-        self.host = f"emulated-{next(self._numbers)}"
+        self.host = host or f"emulated-{next(self._numbers)}"
         _WORLDS[self.host] = self
         _install_fakes()
         self._server = _Server(self)
@@ -205,11 +233,28 @@ class EmulatedWorld:
         self._extra_force = 0.0
         self.q, self._velocity = np.array(state.q), np.zeros(len(state.q))
         self._target: Array | None = None
+        self.free, self._guided = False, 0.0
         self._watchdog, self._kicked = np.inf, self.time
         self._seen = self._sim.observe()
         self._pressed, self._touching = 0.0, frozenset[tuple[str, str]]()
         self._history = deque([(self.time, self._state())])
         self._measure()
+
+    def put_back(self, state: SceneState) -> None:
+        """Put the bodies where a state has them, as a person does; the robot stays where it is."""
+        grip = float(np.clip(self._seen.gripper, 0.0, 1.0))
+        self._sim.reset(
+            dataclasses.replace(state, q=self.q, gripper=grip, gripper_target=self.gripper_target)
+        )
+        self._seen = self._sim.observe()
+
+    def guide(self, hand: Callable[[float], Array] | None) -> None:
+        """Have a hand hold the arm, or none: it moves it as long as the arm lets it.
+
+        Args:
+            hand: where it wants the joints `(n,)` [rad] after so long [s] of moving it.
+        """
+        self._hand = hand
 
     def inject(self, kind: str, time: float) -> None:
         """Have a fault happen at a time [s]: one of `FAULTS`, or "raise:NAME" of a call."""
@@ -273,10 +318,14 @@ class EmulatedWorld:
                 self._server.hang_up()
 
     def _move(self) -> None:
-        """Follow the target, or brake where there is none or the arm must not move."""
+        """Follow the target or the hand, or brake where there is none or it must not move."""
         silent = self.time - self._kicked > self._watchdog
         if self.safety_mode not in (1, 2) or silent:
-            self._target = None
+            self._target, self.free = None, False
+        if self.free:
+            # Weightless, it stays where it is where nobody moves it.
+            self._guided += self._period
+            self._target = self.q if self._hand is None else self._hand(self._guided)
         if self._target is None:
             slower = np.maximum(np.abs(self._velocity) - _BRAKING * self._period, 0.0)
             self._velocity = np.sign(self._velocity) * slower
@@ -318,9 +367,14 @@ class EmulatedWorld:
         if "arm_lost" in self._lost or name in self._raising:
             raise RuntimeError(f"{name}: emulated failure")
 
+    def set_free(self) -> bool:
+        """Whether the arm lets a hand move it from now on, as one does that nothing else moves."""
+        self.free = self.safety_mode in (1, 2) and self._target is None
+        return self.free
+
     def servo(self, q: Array) -> bool:
         """Whether the arm takes a target."""
-        if self.safety_mode not in (1, 2):
+        if self.safety_mode not in (1, 2) or self.free:
             return False
         self.sent.append((self.time, q))
         self._target = q
@@ -330,10 +384,19 @@ class EmulatedWorld:
         """The arm has no target any more."""
         self._target = None
 
+    def end_free(self) -> None:
+        """No hand can move the arm any more."""
+        self._target, self.free = None, False
+
     def kick(self, watchdog: float | None = None) -> None:
         """Its watchdog, of so long [s], is told that all is well."""
         self._watchdog = self._watchdog if watchdog is None else watchdog
         self._kicked = self.time
+
+    @property
+    def gripper_address(self) -> tuple[str, int]:
+        """Host and port of the gripper's server."""
+        return self._server.address
 
     @property
     def opening(self) -> float:
@@ -369,6 +432,92 @@ class EmulatedWorld:
                 _remove_fakes()
 
 
+class TaskWorld(EmulatedWorld):
+    """The emulated world of a task, at the task's start, as the file of a cell describes it."""
+
+    def __init__(
+        self,
+        robot: str,
+        rate_hz: int,
+        task: str,
+        host: str = "emulated",
+        simulator: str = DEFAULT_BACKEND,
+        placement: Sequence[float] = (0.0, 0.0, 0.0),
+        hand: str | None = None,
+        image_height: int = 240,
+        sensor: str = "d405",
+        hand_eye_mm: float = 2.0,
+        hand_eye_deg: float = 0.3,
+        holes: float = Emulation.holes,
+        latency: float = Emulation.latency,
+        jitter: float = Emulation.jitter,
+        lag: float = Emulation.lag,
+        joint_noise: float = Emulation.joint_noise,
+        force_noise: float = Emulation.force_noise,
+        dropped: float = Emulation.dropped,
+        protective_force: float = Emulation.protective_force,
+        seed: int = 0,
+    ) -> None:
+        """Begin with robot and object at the task's start.
+
+        Args:
+            robot: the robot.
+            rate_hz: of the arm's controller.
+            task: the task.
+            host: what its parts know it by.
+            simulator: "pybullet" or "sapien".
+            placement: where the object stands, x, y [m] and yaw [deg] from its middle.
+            hand: a demonstration's file: a hand that holds the arm leads it as the joints went
+                there.
+            image_height: of the cameras' images [pixels].
+            sensor: whose errors the cameras' depth has, one of `SENSORS`.
+            hand_eye_mm, hand_eye_deg: how far the cameras really are from where they should be.
+            holes, latency, jitter, lag, joint_noise, force_noise, dropped, protective_force,
+                seed: as `Emulation` has them.
+
+        Raises:
+            UnknownName: robot, task, simulator or sensor can't be found.
+            InvalidInput: a value is not acceptable.
+            Mismatch: the hand's demonstration is of another robot.
+        """
+        found, spec = get_task(task), get_robot(robot)
+        errors = sensor_errors(sensor, (hand_eye_mm / 1e3, hand_eye_deg))
+        at = Placement(*check_array("placement", placement, (3,)).tolist())
+        led = None if hand is None else _led(hand, spec)
+        self._start = found.initial_state(RobotModel(spec, found.scene.held), at)
+        it = Emulation(
+            rate_hz, lag, joint_noise, force_noise, dropped, latency, jitter, errors, holes,
+            protective_force, seed=seed,
+        )  # fmt: skip
+        super().__init__(spec, found.scene, image_height, it, simulator, host)
+        self.reset(self._start)
+        self.guide(led)
+
+    def attend(self, text: str) -> None:
+        """Do what a person is asked to, which is to put the object back to the start."""
+        self.put_back(self._start)
+
+
+def _led(path: str, robot: RobotSpec) -> Callable[[float], Array]:
+    """Where a hand leads the joints `(n,)` [rad] at a time [s]: as they went in a demonstration."""
+    demonstration = load_demonstration(Path(path))
+    if demonstration.robot != robot.name:
+        raise Mismatch(
+            f"hand: {path} is of robot {demonstration.robot!r}, expected {robot.name!r}; record "
+            "one of it"
+        )
+    joints, times = demonstration.steps.joint_positions, demonstration.timestamps
+    return lambda t: np.array([np.interp(t, times, q) for q in joints.T])
+
+
+class EmulatedGripper(RobotiqSocket):
+    """The driver of a Robotiq gripper, connected to that of an emulated world."""
+
+    def __init__(self, world: str, clock: Clock) -> None:
+        host, port = _world(world).gripper_address
+        super().__init__(host, port, clock=clock)
+
+
 class EmulatedCamera:
     """A camera in an emulated world, by the world's host and the camera's name."""
 
@@ -398,7 +547,7 @@ class EmulatedCamera:
         self._open = False
 
 
-class EmulatedBackend(ForceHardwareBackend):
+class EmulatedBackend(ForceHardwareBackend, GuidedHardwareBackend):
     """The hardware backend over an emulated cell in the scene that it is given.
 
     Attributes:
@@ -553,13 +702,21 @@ class _Control:
         self._world.let_go()
         return True
 
+    def teachMode(self) -> bool:
+        self._world.called("teachMode")
+        return self._world.set_free()
+
+    def endTeachMode(self) -> bool:
+        self._world.called("endTeachMode")
+        self._world.end_free()
+        return True
+
     def stopScript(self) -> None:
         self._world.called("stopScript")
-        self._world.let_go()
+        self._world.end_free()
 
     def disconnect(self) -> None:
         self._world.called("control.disconnect")
-        self._world.let_go()
 
 
 # --- in place of a gripper ----------------------------------------------------------------------

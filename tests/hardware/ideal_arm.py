@@ -39,6 +39,12 @@ class IdealArm:
                 raise ConnectionError("cable pulled")
         self._q = q
 
+    def guide(self):
+        self._note("guide")
+
+    def hold(self):
+        self._note("hold")
+
     def wait(self):
         self._due = max(self._due + self._period, self._clock())
         time.sleep(max(0.0, self._due - self._clock()))

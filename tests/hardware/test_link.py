@@ -71,6 +71,24 @@ def test_what_goes_wrong_there_is_said_here_and_the_arm_is_stopped(make, robot, 
     assert notes(tmp_path)[-1] == "disconnect"
 
 
+def test_a_hand_guides_it_in_real_time_until_it_is_held(make, robot, tmp_path):
+    link = make()
+    link.guide()
+    began = time.monotonic()
+    for _ in range(3):
+        link.push(robot.home[None] + 1.0, 0.1)
+        link.wait(0.0)
+    # However slowly it follows targets.
+    assert 0.2 < time.monotonic() - began < 3.0
+    np.testing.assert_array_equal(link.hold().q, robot.home)
+    link.push(robot.home[None] + 0.01, 0.2)
+    link.wait(0.0)
+    link.close()
+    said = notes(tmp_path)
+    assert said[:3] == ["connect", "start", "guide"] and said[-3:] == ["hold", "stop", "disconnect"]
+    assert said.count("guide") >= 10
+
+
 def test_an_end_of_this_process_stops_the_arm(make, tmp_path, wait_until):
     """However it ends, what is left of it is a closed pipe."""
     link = make()

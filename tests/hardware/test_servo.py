@@ -50,6 +50,12 @@ class Arm:
         assert period == self.period
         self.sent.append(q)
 
+    def guide(self):
+        self._called("guide")
+
+    def hold(self):
+        self._called("hold")
+
     def wait(self):
         self._called("wait")
         self.time += self.period
@@ -231,3 +237,66 @@ def test_limits_of_a_cell_are_checked_on_their_own():
     spec = dataclasses.replace(limits(MODEL), force=10.0)
     assert spec.workspace.outside(spec.workspace.low) == 0
     assert spec.workspace.outside(spec.workspace.high + 0.1) == pytest.approx(0.1)
+
+
+# --- guided by hand -----------------------------------------------------------------------------
+
+
+def test_while_guided_no_target_is_sent_and_what_is_given_takes_its_time():
+    arm, servo = make(speed_scale=0.1)
+    servo.start()
+    servo.push(HOME[None] + 0.01, 1.0)
+    run(servo, 0.1)
+    sent = len(arm.sent)
+    servo.guide()
+    arm.state["force"], arm.state["q"] = 400.0, HOME + 0.5
+    began = arm.time
+    for i in range(1, 31):
+        servo.push(HOME[None], 1 / 30)
+        end = servo._pushed
+        while servo.consumed < end:
+            servo.tick()
+        assert arm.time - began == pytest.approx(i / 30, abs=1.01 * arm.period)
+    assert len(arm.sent) == sent
+    # The hand's force is no longer one afterwards, and the motion begins where it left the arm.
+    del arm.state["force"]
+    assert servo.hold().q[0] == HOME[0] + 0.5
+    run(servo, 0.1)
+    np.testing.assert_array_equal(arm.sent[sent:], np.repeat(HOME[None] + 0.5, 12, axis=0))
+
+
+@pytest.mark.parametrize("state", [{"trouble": "protective stop"}, {"time": -1.0}])
+def test_what_is_wrong_while_guided_stops_it(state):
+    arm, servo = make()
+    servo.start()
+    servo.guide()
+    run(servo, 0.1)
+    arm.state |= state
+    with pytest.raises(RobotStopped):
+        servo.tick()
+    assert arm.calls[-1] == "stop"
+
+
+@pytest.mark.parametrize("raising", ["guide", "hold", "read", "wait"])
+def test_whichever_call_raises_while_guided_it_is_stopped(raising):
+    arm, servo = make()
+    servo.start()
+    servo.guide()
+    arm.raising = raising
+    with pytest.raises(RobotStopped, match="emulated failure"):
+        servo.tick()
+        servo.hold()
+    assert arm.calls[-1] == "stop"
+    with pytest.raises(RobotStopped):
+        servo.tick()
+
+
+def test_an_arm_that_a_hand_may_move_is_held_once_nobody_follows_it_any_more():
+    arm, servo = make()
+    servo.start()
+    servo.guide()
+    servo.push(HOME[None], 0.5)
+    began = arm.time
+    with pytest.raises(RobotStopped, match="the program doesn't follow any more"):
+        run(servo, 3.0)
+    assert 1.4 < arm.time - began < 1.7 and arm.calls[-1] == "stop"

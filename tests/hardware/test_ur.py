@@ -108,6 +108,43 @@ def test_the_controller_s_watchdog_stops_an_arm_that_gets_no_targets(arm, world)
     np.testing.assert_array_equal(world.q, after)
 
 
+def test_a_hand_guides_it_in_freedrive_once_nothing_else_moves_it(arm, world):
+    arm.start()
+    arm.servo(world.q, 1 / 125)
+    arm.wait()
+    world.calls.clear()
+    for _ in range(30):
+        arm.guide()
+        arm.wait()
+    called = names(world)
+    assert called.index("servoStop") < called.index("teachMode") and called.count("teachMode") == 1
+    assert called.count("kickWatchdog") > 30 and world.free
+    arm.hold()
+    arm.hold()
+    assert names(world).count("endTeachMode") == 1 and not world.free
+    arm.servo(world.q, 1 / 125)
+    # Again, and ended by a stop.
+    arm.guide()
+    arm.stop()
+    assert not world.free
+
+
+def test_one_that_refuses_freedrive_says_so_and_leaves_it_all_the_same(arm, world):
+    arm.start()
+    world.safety_mode = 3
+    with pytest.raises(ConnectionError, match="refuses freedrive; see the pendant"):
+        arm.guide()
+    arm.stop()
+    assert "endTeachMode" in names(world)
+
+
+def test_the_controller_s_watchdog_ends_freedrive(arm, world):
+    arm.start()
+    arm.guide()
+    world.advance(0.5)
+    assert not world.free
+
+
 @pytest.mark.parametrize("name", ["lookahead", "watchdog_hz", "deceleration", "payload"])
 def test_options_out_of_range_are_refused(name):
     with pytest.raises(InvalidInput, match=f"{name}: expected"):

@@ -1,4 +1,4 @@
-"""What steers the tool in teleoperation: keyboard, SpaceMouse, gamepad, or a script.
+"""What steers the tool: keyboard, SpaceMouse, gamepad, a hand on the arm itself, or a script.
 
 A new device is one file and one line in `DEVICES`: what is named there is called with a
 `DeviceSetup`. One outside the repository needs no line, `package.module:NAME` or
@@ -20,6 +20,7 @@ DEVICES = {
     "keyboard": "sart_toolkit.record.devices.keyboard:Keyboard",
     "spacemouse": "sart_toolkit.record.devices.spacemouse:SpaceMouse",
     "gamepad": "sart_toolkit.record.devices.gamepad:Gamepad",
+    "hand_guiding": "sart_toolkit.record.devices.hand_guiding:HandGuiding",
 }
 
 
