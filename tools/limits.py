@@ -147,7 +147,7 @@ class _Wild:
     def reset(self) -> None:
         self._steps = 0
 
-    def act(self, images: Mapping[str, Image], gripper: float) -> Array:
+    def act(self, images: Mapping[str, Image], gripper: float, up: Array) -> Array:
         if self._steps % 4 == 0:
             far = self._rng.uniform(-_FAR, _FAR, 3)
             turn = self._rng.uniform(-_TURN, _TURN, 3)

@@ -143,6 +143,8 @@ def _check_whole(content: bytes) -> None:
     Raises:
         ValueError: it does.
     """
+    if not content:
+        raise ValueError("it is empty")
     if content[:5].lower() == b"solid" and b"facet" in content[:2000]:
         if b"endsolid" not in content[-200:].lower():
             raise ValueError("it breaks off before endsolid")

@@ -36,7 +36,7 @@ class Upwards:
     def reset(self):
         self.seen.clear()
 
-    def act(self, images, gripper):
+    def act(self, images, gripper, up):
         self.seen.append(images["wrist"].shape)
         return np.array([0, 0, -self.step, 0, 0, 0, 0.0])
 

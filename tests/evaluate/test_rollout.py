@@ -53,7 +53,7 @@ class Player:
     def reset(self):
         self.seen = []
 
-    def act(self, images, gripper):
+    def act(self, images, gripper, up):
         self.seen.append((images["wrist"], gripper))
         at = len(self.seen) - 1
         return self.actions[at] if at < len(self.actions) else STILL

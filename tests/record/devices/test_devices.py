@@ -7,14 +7,30 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sart_toolkit.backends.interface import Guides
 from sart_toolkit.errors import DeviceLost, InvalidInput, UnknownName
 from sart_toolkit.record.devices import DEVICES, make_device
 from sart_toolkit.record.devices.manual import SPEEDS, Control, ManualDevice, views
 from sart_toolkit.record.session import TeleopCommand
 
 
+class Guided(Guides):
+    """In place of a backend whose arm a hand may move."""
+
+    def __init__(self, scene):
+        self.scene = scene
+
+    def guide(self):
+        pass
+
+    def hold(self):
+        pass
+
+
 @pytest.fixture(params=DEVICES)
 def device(request, peg_setup):
+    if request.param == "hand_guiding":
+        peg_setup = dataclasses.replace(peg_setup, backend=Guided(peg_setup.backend.scene))
     return make_device(request.param, peg_setup)
 
 
