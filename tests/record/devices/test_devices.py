@@ -17,8 +17,8 @@ from sart_toolkit.record.session import TeleopCommand
 class Guided(Guides):
     """In place of a backend whose arm a hand may move."""
 
-    def __init__(self, scene):
-        self.scene = scene
+    def __init__(self, backend):
+        self.scene, self.rates = backend.scene, backend.rates
 
     def guide(self):
         pass
@@ -30,7 +30,7 @@ class Guided(Guides):
 @pytest.fixture(params=DEVICES)
 def device(request, peg_setup):
     if request.param == "hand_guiding":
-        peg_setup = dataclasses.replace(peg_setup, backend=Guided(peg_setup.backend.scene))
+        peg_setup = dataclasses.replace(peg_setup, backend=Guided(peg_setup.backend))
     return make_device(request.param, peg_setup)
 
 
