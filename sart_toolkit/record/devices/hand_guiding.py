@@ -15,7 +15,7 @@ class HandGuiding(ManualDevice):
 
     name = "hand_guiding"
     guides = True
-    key_map = (("Your hand", "moves the arm while it records"),)
+    key_map = (("Your hand", "moves it while recording"),)
 
     def __init__(self, setup: DeviceSetup) -> None:
         """Guide the arm of a backend that can be guided.
