@@ -8,12 +8,14 @@ has the robot stopped then.
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from sart_toolkit.data.records import DepthImage, Image
+from sart_toolkit.errors import MissingExtra
 from sart_toolkit.poses import Array
 
 Clock = Callable[[], float]
@@ -172,3 +174,20 @@ class ClockOffset:
         if self._least is None or now - stamp < self._least:
             self._least = now - stamp
         return stamp + self._least
+
+
+def imported(name: str, need: str, extra: str) -> Any:
+    """A module of a driver's library, imported when it is needed.
+
+    Args:
+        name: of the module.
+        need: what needs which library.
+        extra: of the toolkit's, that brings it.
+
+    Raises:
+        MissingExtra: it isn't installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingExtra(f"{need} ({error}); pip install sart_toolkit[{extra}]") from error

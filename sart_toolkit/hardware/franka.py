@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.errors import MissingExtra
-from sart_toolkit.hardware.drivers import ArmState, Clock, ClockOffset, Periods
+from sart_toolkit.hardware.drivers import ArmState, Clock, ClockOffset, Periods, imported
 from sart_toolkit.poses import Array, check_array
+
+_LIBRARY = "a Franka arm needs panda-py", "franka"
 
 _IDLE, _MOVE = 1, 2
 _UNLOCK = "unlock its joints and activate FCI in Desk"
@@ -68,7 +69,7 @@ class Franka:
         self._started = self._guided = False
 
     def connect(self) -> None:
-        self._panda = _imported("panda_py").Panda(self._host)
+        self._panda = imported("panda_py", *_LIBRARY).Panda(self._host)
 
     def start(self) -> None:
         # From here on it has to be stopped, whatever becomes of it.
@@ -77,7 +78,9 @@ class Franka:
         self._periods.start()
 
     def _follow(self) -> None:
-        made = _imported("panda_py.controllers").JointPosition(**self._gains)
+        made = imported(
+            "panda_py.controllers", "a Franka arm needs panda-py", "franka"
+        ).JointPosition(**self._gains)
         self._panda.start_controller(made)
         self._controller, self._sent = made, None
 
@@ -139,14 +142,3 @@ class Franka:
         if self._started and mode != _MOVE:
             return "its controller has ended; see Desk"
         return ""
-
-
-def _imported(name: str) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise MissingExtra(
-            f"a Franka arm needs panda-py ({error}); pip install sart_toolkit[franka]"
-        ) from error

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from sart_toolkit.errors import MissingExtra
-from sart_toolkit.hardware.drivers import ArmState, Clock, ClockOffset
+from sart_toolkit.hardware.drivers import ArmState, Clock, ClockOffset, imported
 from sart_toolkit.poses import Array, check_array, check_positive
+
+_LIBRARY = "a UR arm needs ur-rtde", "ur"
 
 _RUNNING = 7
 _ROBOT_MODES = {
@@ -89,11 +90,11 @@ class UrRtdeArm:
         self._guided = False
 
     def connect(self) -> None:
-        module = _imported("rtde_receive")
+        module = imported("rtde_receive", *_LIBRARY)
         self._receive = module.RTDEReceiveInterface(self._host, self._rate_hz)
 
     def start(self) -> None:
-        module = _imported("rtde_control")
+        module = imported("rtde_control", *_LIBRARY)
         self._control = module.RTDEControlInterface(self._host, self._rate_hz)
         self._control.setWatchdog(self._watchdog_hz)
         if self._payload is not None:
@@ -167,17 +168,6 @@ class UrRtdeArm:
         if receive is not None:
             with suppress(Exception):
                 receive.disconnect()
-
-
-def _imported(name: str) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise MissingExtra(
-            f"a UR arm needs ur-rtde ({error}); pip install sart_toolkit[ur]"
-        ) from error
 
 
 def _trouble(robot_mode: int, safety_mode: int) -> str:

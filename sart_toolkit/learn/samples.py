@@ -100,16 +100,13 @@ class WindowConfig:
 class Variation:
     """How each of a batch's windows is varied.
 
-    `offsets (B, 2)` int64: the row and column in 0..2 `image_shift` at which its images are cut.
-    `runs (B,)` int64: windows of one run are varied alike and share images.
+    `runs (B,)` int64: which run each is of; windows of one run are varied alike and share images.
+    `offsets (R, 2)` int64: the row and column in 0..2 `image_shift` at which a run's images are
+    cut.
     """
 
     offsets: Tensor
     runs: Tensor
-
-    def to(self, device: torch.device) -> Variation:
-        """The same in the memory of a device."""
-        return Variation(self.offsets.to(device), self.runs.to(device))
 
 
 @dataclass(frozen=True)
@@ -168,11 +165,7 @@ class Windows:
         if shared:
             steps, where = steps.unique(return_inverse=True)
         of, steps = steps // len(self.gripper), steps % len(self.gripper)
-        offsets = None
-        if variation is not None:
-            # A run's windows are varied alike: any of them tells how.
-            different, first = _first_of_each(runs)
-            offsets = variation.offsets[first][torch.searchsorted(different, of)]
+        offsets = None if variation is None else variation.offsets[of]
         batch = {
             "gripper": self.gripper[at],
             "up": self.up[at[:, -1]],
@@ -386,14 +379,6 @@ def _write(
         "data_hash": digest({"frames": sha.hexdigest(), **arrays}),
     }
     return {name: torch.from_numpy(array) for name, array in arrays.items()}, about
-
-
-def _first_of_each(runs: Tensor) -> tuple[Tensor, Tensor]:
-    """The different ones, sorted, and where each comes first."""
-    different, inverse = runs.unique(return_inverse=True)
-    first = torch.full_like(different, len(runs))
-    at = torch.arange(len(runs), device=runs.device)
-    return different, first.scatter_reduce(0, inverse, at, "amin")
 
 
 def _trajectories(

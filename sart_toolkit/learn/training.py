@@ -266,12 +266,13 @@ def epoch_batches(
     rng = np.random.default_rng([config.seed, epoch])
     together = _TOGETHER if get_policy(config.policy).shares_pictures else 1
     order, runs = windows.epoch_order(rng, config.weighting, together)
-    n = int(runs.max()) + 1
-    offsets = rng.integers(0, 2 * config.image_shift + 1, (n, 2))
+    offsets = torch.from_numpy(
+        rng.integers(0, 2 * config.image_shift + 1, (int(runs.max()) + 1, 2))
+    ).to(windows.device)
     return [
         (
             torch.from_numpy(some).to(windows.device),
-            Variation(*map(torch.from_numpy, (offsets[of], of))).to(windows.device),
+            Variation(offsets, torch.from_numpy(of).to(windows.device)),
         )
         # Of nearly equal size: a small last batch would disturb BatchNorm.
         for some, of in zip(

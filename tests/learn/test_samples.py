@@ -281,8 +281,8 @@ def test_each_cameras_images_are_those_it_has_alone(two_cameras, open_windows, s
 def test_a_shared_batch_has_each_picture_of_a_run_once(two_cameras, open_windows):
     windows = open_windows(two_cameras, cameras=("wrist", "overview"), image_shift=2)
     chosen = torch.tensor([0, 1, 2, 2, 9, 10, 11, 1])
-    runs = torch.tensor([5, 5, 5, 5, 0, 0, 0, 7])
-    offsets = torch.tensor([[0, 1]] * 4 + [[4, 2]] * 3 + [[3, 3]])
+    runs = torch.tensor([1, 1, 1, 1, 0, 0, 0, 3])
+    offsets = torch.tensor([[4, 2], [0, 1], [2, 2], [3, 3]])
     apart = windows.batch(chosen, _varied(offsets, runs=runs))
     shared = windows.batch(chosen, _varied(offsets, runs=runs), shared=True)
     assert torch.equal(apart["gripper"], shared["gripper"])
